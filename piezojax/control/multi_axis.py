@@ -2,21 +2,21 @@
 
 from typing import ClassVar, NamedTuple
 
-import jax
 import jax.numpy as jnp
 
-from ..core.arrays import State, as_array
+from ..core.arrays import State, as_scalars
 from ..core.axes import (
     Axes,
     Matrix,
     Rows,
     as_full,
+    as_matrices,
     as_matrix,
+    as_rows,
     check_square,
-    diagonal,
-    inverse,
-    matrix_product,
     minus,
+    packed_matrices,
+    packed_matrix,
     plus,
     product,
 )
@@ -112,36 +112,26 @@ class MultiAxisSlidingMode(Designed):
 
     def resolved(self) -> "ResolvedMultiAxis":
         """Return the controller with its gain matrices computed."""
-        A, surface = self.model.autoregressive, tuple(map(as_full, self.surface))
-        q, lags = self.model.axes, len(self.model.moving) - 1
-        unit = diagonal([1.0] * q)
-        decoupling = as_full(self.decoupling)
-        shared = plus(unit, jax.tree.map(lambda k: lags * k, decoupling))
-        forward = matrix_product(shared, inverse(plus(*self.model.moving)))
-        driven = plus(
-            *(
-                matrix_product(S, h)
-                for S, h in zip(surface, self.model.responses(), strict=True)
-            )
-        )
-        reach = inverse(driven)
-        equivalent = []
-        for j, S in enumerate(surface):
-            # X2 moves up by one block; the A of the model give the last block.
-            moved = matrix_product(surface[-1], A[-1 - j])
-            if j > 0:
-                moved = plus(moved, surface[j - 1])
-            wanted = minus(matrix_product(as_full(self.reaching), S), moved)
-            equivalent.append(matrix_product(reach, wanted))
+        # Packed: of scalars, XLA copies the terms into every result that contains them,
+        # and takes several times as long to compile.
+        A, B = map(packed_matrices, (self.model.autoregressive, self.model.moving))
+        S = packed_matrices(map(as_full, self.surface))
+        PHI = packed_matrix(as_full(self.reaching))
+        lags, q = len(B) - 1, self.model.axes
+        shared = jnp.eye(q) + lags * packed_matrix(as_full(self.decoupling))
+        forward = shared @ jnp.linalg.inv(B.sum(0))
+        driven = (S @ self.model.responses()).sum(0)
+        # X2 moves up by one block; the A of the model give the last block.
+        moved = (S[-1] @ A[::-1]).at[1:].add(S[:-1])
         return ResolvedMultiAxis(
             self.law,
             self.decoupling,
             self.surface,
             self.model,
-            forward=forward,
-            past_desired=tuple(matrix_product(forward, a) for a in A),
-            rest=inverse(shared),
-            equivalent=tuple(equivalent),
+            forward=as_rows(forward),
+            past_desired=as_matrices(forward @ A),
+            rest=as_rows(jnp.linalg.inv(shared)),
+            equivalent=as_matrices(jnp.linalg.inv(driven) @ (PHI @ S - moved)),
             reference_model=self.reference_model,
         )
 
@@ -202,31 +192,30 @@ class ResolvedMultiAxis(System):
         return _summed(self.surface, predicted)
 
     def init(self, input: Observation) -> MultiAxisState:
-        model = self.model
-        q, p = model.axes, len(model.moving)
-        desired = (tuple(as_array(r) for r in input.reference),) * p
-        zero = (jnp.zeros_like(desired[0][0]),) * q
+        desired = as_scalars(input.reference)
+        measured, applied = map(as_scalars, (input.measured, input.applied))
+        p = len(self.surface)
+        # Packed, as in ``MultiAxisSlidingMode.resolved``.
+        A, B = map(packed_matrices, (self.model.autoregressive, self.model.moving))
+        r = jnp.stack(desired)
         # At rest u1 equals its past: (I + (p-1) K_s) u1 = F1 R1.
-        wanted = self._forward((*desired, desired[0]), (zero,) * (p - 1))
-        forward = product(self.rest, wanted)
-        feedback = minus(tuple(as_array(u) for u in input.applied), forward)
-        error = minus(tuple(as_array(z) for z in input.measured), desired[0])
-        predicted = [error]
-        A, B = model.autoregressive, model.moving
+        wanted = packed_matrix(self.forward) @ (r - A.sum(0) @ r)
+        forward = packed_matrix(self.rest) @ wanted
+        feedback, error = jnp.stack(applied) - forward, jnp.stack(measured) - r
+        blocks = [error]
         for j in range(1, p):
-            terms = [product(A[i], predicted[j - 1 - i]) for i in range(j)]
-            terms += [product(A[i], error) for i in range(j, p)]
-            terms += [product(B[i], feedback) for i in range(j, p)]
-            predicted.append(plus(*terms))
-        sliding = self._sliding(tuple(predicted))
-        equivalent = _summed(self.equivalent, tuple(predicted))
+            known = (A[:j] @ jnp.stack(blocks[::-1])[:, :, None])[:, :, 0].sum(0)
+            blocks.append(known + A[j:].sum(0) @ error + B[j:].sum(0) @ feedback)
+        predicted = tuple(as_scalars(block) for block in blocks)
+        feedback, forward = as_scalars(feedback), as_scalars(forward)
+        equivalent = _summed(self.equivalent, predicted)
         return MultiAxisState(
-            reference_model=self.reference_model.init(desired[0]),
-            desired=desired,
+            reference_model=self.reference_model.init(desired),
+            desired=(desired,) * p,
             forward=(forward,) * max(p - 1, 1),
             feedback=feedback,
-            predicted=tuple(predicted),
-            law=self.law.start(sliding, minus(feedback, equivalent)),
+            predicted=predicted,
+            law=self.law.start(self._sliding(predicted), minus(feedback, equivalent)),
         )
 
     def step(

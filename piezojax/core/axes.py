@@ -80,6 +80,11 @@ def packed_matrix(rows: Rows) -> jax.Array:
     return jnp.stack([jnp.stack(row) for row in rows])
 
 
+def packed_matrices(matrices: Iterable[Rows]) -> jax.Array:
+    """Return matrices of one size as a packed array [matrices, rows, columns]."""
+    return jnp.stack([packed_matrix(rows) for rows in matrices])
+
+
 def product(matrix: Plain, vector: Plain) -> Plain:
     """Return ``matrix @ vector``; a Matrix may be a diagonal."""
     if not isinstance(matrix[0], tuple):
@@ -93,12 +98,6 @@ def product(matrix: Plain, vector: Plain) -> Plain:
     )
 
 
-def matrix_product(left: Plain, right: Plain) -> Plain:
-    """Return ``left @ right``."""
-    columns = tuple(zip(*right, strict=True))
-    return tuple(zip(*(product(left, column) for column in columns), strict=True))
-
-
 def plus(*terms: T) -> T:
     """Return the sum of vectors, or, row by row, of matrices."""
     return jax.tree.map(lambda *values: sum(values[1:], values[0]), *terms)
@@ -107,38 +106,6 @@ def plus(*terms: T) -> T:
 def minus(left: T, right: T) -> T:
     """Return the difference of two vectors or matrices."""
     return jax.tree.map(lambda a, b: a - b, left, right)
-
-
-def inverse(matrix: Plain) -> Plain:
-    """Return the inverse of a square matrix.
-
-    A matrix of up to 3 rows is inverted in closed form, a larger one by a linear solve,
-    which is slow inside a loop over time.
-    """
-    size = len(matrix)
-    if size > 3:
-        return as_rows(jnp.linalg.inv(packed_matrix(matrix)))
-    cofactors = tuple(
-        tuple((-1.0) ** (i + j) * _minor(matrix, i, j) for j in range(size))
-        for i in range(size)
-    )
-    determinant = sum(m * c for m, c in zip(matrix[0], cofactors[0], strict=True))
-    return tuple(
-        tuple(cofactors[j][i] / determinant for j in range(size)) for i in range(size)
-    )
-
-
-def _minor(matrix: Plain, row: int, column: int) -> Any:
-    rest = [
-        [value for j, value in enumerate(values) if j != column]
-        for i, values in enumerate(matrix)
-        if i != row
-    ]
-    if not rest:
-        return as_array(1.0)
-    if len(rest) == 1:
-        return rest[0][0]
-    return rest[0][0] * rest[1][1] - rest[0][1] * rest[1][0]
 
 
 def _is_axes(node: Any) -> bool:

@@ -9,7 +9,7 @@ from ..core.axes import (
     Rows,
     as_matrices,
     check_square,
-    matrix_product,
+    packed_matrices,
     packed_matrix,
     plus,
     product,
@@ -53,16 +53,15 @@ class MatrixARMA(System):
         """Number of inputs and of outputs q."""
         return len(self.moving[0])
 
-    def responses(self) -> tuple[Rows, ...]:
-        """Return the first p Markov parameters h_0 = C B, h_1 = C A B, ..., (7.6)."""
-        responses: list[Rows] = []
-        for j, moved in enumerate(self.moving):
-            fed_back = [
-                matrix_product(self.autoregressive[i], responses[j - 1 - i])
-                for i in range(j)
-            ]
-            responses.append(plus(moved, *fed_back))
-        return tuple(responses)
+    def responses(self) -> jax.Array:
+        """Return the Markov parameters h_0 = C B, h_1 = C A B, ..., (7.6) [p, q, q]."""
+        A = packed_matrices(self.autoregressive)
+        responses: list[jax.Array] = []
+        for moved in packed_matrices(self.moving):
+            for a, h in zip(A, reversed(responses), strict=False):
+                moved = moved + a @ h
+            responses.append(moved)
+        return jnp.stack(responses)
 
     def dc_gain(self) -> jax.Array:
         """Return outputs over inputs at rest [q, q]."""
@@ -144,9 +143,11 @@ def _check_added(model: StateSpace, autoregressive: list[np.ndarray]) -> None:
     q = len(autoregressive[0])
     companion = np.eye(q * len(autoregressive), k=-q)
     companion[:q] = np.hstack(autoregressive)
-    radius = np.abs(np.linalg.eigvals(companion)).max()
-    own = np.abs(model.poles()).max()
-    if own < 1.0 <= radius:
+    own, added = np.asarray(model.poles()), np.linalg.eigvals(companion)
+    for pole in own:
+        added = np.delete(added, np.argmin(np.abs(added - pole)))
+    radius = np.abs(added).max(initial=0.0)
+    if np.abs(own).max() < 1.0 <= radius:
         raise ValueError(
             f"a mode added to fill {len(autoregressive)} lags has radius {radius:.6g}; "
             "it must be below 1: reduce the model, or give other lags"

@@ -25,7 +25,6 @@ from piezojax.core.axes import (
     as_matrix,
     as_rows,
     check_square,
-    inverse,
     packed,
     product,
 )
@@ -282,15 +281,11 @@ def test_observability_form_has_the_response_of_the_state_space():
     np.testing.assert_allclose(model.dc_gain(), dc_gain, rtol=0.0, atol=1e-11)
 
 
-@pytest.mark.parametrize("size", [1, 2, 3, 4])
-def test_the_inverse_of_rows(size):
-    matrix = np.random.default_rng(size).normal(size=(size, size))
-    found = inverse(as_rows(matrix))
-    np.testing.assert_allclose(found, np.linalg.inv(matrix), rtol=1e-10)
-    vector = jnp.arange(1.0, size + 1.0)
-    np.testing.assert_allclose(
-        product(as_rows(matrix), tuple(vector)), matrix @ vector, rtol=1e-12
-    )
+def test_a_product_of_rows():
+    rng = np.random.default_rng(0)
+    matrix, vector = rng.normal(size=(3, 4)), rng.normal(size=4)
+    found = product(as_rows(matrix), tuple(vector))
+    np.testing.assert_allclose(found, matrix @ vector, rtol=1e-12)
 
 
 # Refused input
