@@ -305,8 +305,8 @@ def _command(name: str) -> str:
     main = import_module(f"piezojax.cli.{name}").main
     info = main.to_info_dict(click.Context(main))
     options = [each for each in info["params"] if each["param_type_name"] == "option"]
-    arguments = [each for each in info["params"] if each not in options]
-    given = " ".join(_argument(each) for each in arguments)
+    arguments = [each for each in main.params if isinstance(each, click.Argument)]
+    given = " ".join(map(_argument, arguments))
     parts = [
         f"## `python -m piezojax.{name}`\n",
         f"```text\npython -m piezojax.{name} {given} [OPTIONS]\n```\n".replace(
@@ -320,9 +320,10 @@ def _command(name: str) -> str:
     return "\n".join(parts) + "\n"
 
 
-def _argument(each: dict[str, Any]) -> str:
-    name = each["name"].upper() + ("..." if each["nargs"] == -1 else "")
-    return name if each["required"] else f"[{name}]"
+def _argument(each: click.Argument) -> str:
+    several = "..." if each.nargs == -1 else ""
+    name = each.metavar or f"{each.name}{several}".upper()
+    return name if each.required else f"[{name}]"
 
 
 def _option(each: dict[str, Any]) -> str:

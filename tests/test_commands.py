@@ -876,6 +876,10 @@ def test_reproduce_simulates_each_table_once(made_up, tmp_path):
     twice = ("--table", "5-5", "--table", "5-3", "--table", "5-5")
     succeeded(call("reproduce", *twice, "--out", tmp_path / "b"))
     assert made_up == ["5-5", "5-3"]
+    named = ("--table", "figure-4-5", "--table", "4-6")
+    printed = succeeded(call("reproduce", *named, "--out", tmp_path / "c")).stdout
+    assert "simulating Figure 4-5\n" in printed
+    assert "simulating Table 4-6\n" in printed
 
 
 def test_calibration_takes_no_tables(tmp_path):

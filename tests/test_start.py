@@ -489,6 +489,13 @@ def test_answers_to_a_study_that_is_written_are_refused(run, tmp_path, record):
     printed = CliRunner().invoke(start.main, [str(other), *out])
     assert printed.exit_code == 1
     assert f"does not follow {other}: edit it" in printed.output
+    path = tmp_path / "out" / "study.toml"
+    table = re.compile(r"\[plant\].*?\n\n", re.DOTALL)
+    model = '[plant]\nfile = "model.json"\n\n'
+    path.write_text(table.sub(model, path.read_text(encoding="utf-8")))
+    status, output, calls = run()
+    assert (status, calls) == (1, [])
+    assert f"does not follow {record}: edit it" in output
 
 
 def test_alarms_of_earlier_gains_are_printed_again(run):

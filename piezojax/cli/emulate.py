@@ -1,5 +1,6 @@
 """``python -m piezojax.emulate STUDY``."""
 
+from contextlib import suppress
 from pathlib import Path
 
 import click
@@ -77,6 +78,8 @@ def main(study, plant, gain, delay, slew, largest_error, port, speed, seed, quie
         with StageServer(stage, port) as server:
             click.echo(f"stage at {server.address}")
             console.print("Ctrl-C ends it")
-            server.serve_forever()
+            with suppress(KeyboardInterrupt):
+                server.serve_forever()
+        console.print("the emulator has ended")
 
     run(quiet, body)

@@ -146,7 +146,8 @@ class _Gain(click.ParamType):
     type=click.IntRange(min=1),
     default=200,
     show_default=True,
-    help="Largest number of optimiser steps.",
+    help="Largest number of optimiser steps; the methods output_error, steady_state "
+    "and scheduled_frequency_response use it.",
 )
 @click.option(
     "--train", type=SampleRange(), help="Samples to fit (default: first half)."

@@ -128,10 +128,15 @@ def _read(
         raise ValueError(
             "a file of --response needs a --rate: the sampling rate of the controller"
         )
-    if columns["period"] or options.realisations != 1 or options.skip is not None:
+    of_records = {
+        "--period": columns["period"],
+        "--realisations": options.realisations != 1,
+        "--skip": options.skip is not None,
+        "--segment": options.segment is not None,
+    }
+    if named := [name for name, given in of_records.items() if given]:
         raise ValueError(
-            "--period, --realisations and --skip need a --method: the RECORD is then "
-            "a record over time"
+            f"{', '.join(named)} need a --method: the RECORD is then a record over time"
         )
     responses = [
         response

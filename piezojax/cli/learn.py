@@ -51,7 +51,7 @@ def main(results, name, reference, runs, points, named, out, seed, quiet):
         from ..report.page import write_page
         from ..stages.learning import learn_reference
 
-        result, gains, motions = tuned_gains(results)
+        result, gains, motions = tuned_gains(results, named)
         names = [motion.name for motion in motions]
         if reference is not None and reference not in names:
             raise ValueError(

@@ -23,12 +23,13 @@ stage_option: Callable = click.option(
 
 
 def tuned_gains(
-    results: Path,
+    results: Path, named: Path | None = None
 ) -> "tuple[Result, dict[str, float], Sequence[Motion]]":
     """Return result, gains and motions of a folder of ``tune``.
 
-    The paths of the gains are relative to the controller. Raises ValueError for gains
-    with an alarm, and for a folder without gains.
+    The paths of the gains are relative to the controller. ``named`` is the file of the
+    study, by default the one in the folder. Raises ValueError for gains with an alarm,
+    a folder without gains, and a study that lacks one of the tuned references.
     """
     from ..core.serial import load
     from ..stages.of_study import motions_of
@@ -44,7 +45,13 @@ def tuned_gains(
         path.removeprefix("controller."): value for path, value in result.gains.items()
     }
     promised = {name: error for name, error in promised.items() if error is not None}
-    motions = motions_of(load_study(results / STUDY_FILE), results, promised)
+    study = named or results / STUDY_FILE
+    motions = motions_of(load_study(study), study.parent, promised)
+    known = {motion.name for motion in motions}
+    if missing := [name for name in promised if name not in known]:
+        raise ValueError(
+            f"{study} has no reference {missing[0]}: it is not the study of {results}"
+        )
     return result, gains, motions
 
 

@@ -47,6 +47,7 @@ def main(tables, calibrate, out, seed, quiet):
         from ..report.summary_tables import reproduction_table
         from ..report.table_pictures import write_picture, write_rates
         from ..reproduction import reproduce
+        from ..reproduction.cell import title_of
         from ..reproduction.rates import FIGURE, errors_by_rate, rates_as_csv
         from ..reproduction.summary import as_csv, summarise
 
@@ -65,7 +66,7 @@ def main(tables, calibrate, out, seed, quiet):
                 write_text(folder / f"{FIGURE}.csv", rates_as_csv(errors))
                 write_rates(errors, folder)
                 return
-            bar.stage(f"simulating Table {table}")
+            bar.stage(f"simulating {title_of(table)}")
             cells.extend(reproduce(table))
             write_text(folder / "cells.csv", as_csv(cells))
             plain = {t: entry.model_dump() for t, entry in summarise(cells).items()}

@@ -227,7 +227,7 @@ def _check_same(study: Path, record: Path, given: dict[str, Any]) -> None:
     from ..core.files import seen_from
     from ..study import load
 
-    known = load(study).plant["record"]
+    known = load(study).plant.get("record", [])  # a study may name a model instead
     known = known if isinstance(known, list) else [known]
     named = [f"--{name}" for name, value in given.items() if value is not None]
     if seen_from(study.parent, record) not in known:

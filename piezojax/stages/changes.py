@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import BaseModel
 
-from ..core.files import write_report
+from ..core.files import read_model, write_report
 from ..core.progress import Progress, Silent
 from ..identification import Record
 from .protocol import Gains, LostError, Stage, StoppedError
@@ -215,11 +215,12 @@ def watch(
     become a baseline themselves, after a run that does not count. ``folder`` receives
     the samples of every run that counts, and the report. The stage keeps ``gains``; it
     is made safe after a failure. Raises ValueError for a ``baseline`` of another
-    reference or with too few runs.
+    reference, of other gains, without its report or with too few runs.
     """
     known = None
     if baseline is not None:
         known = Baseline(read_runs(baseline, stage.dt), motion.start)
+        _check_gains(baseline, gains)
     elif runs < FEATURES + 2:
         raise ValueError(
             f"a baseline needs at least {FEATURES + 2} runs, not {runs}; give more "
@@ -246,6 +247,25 @@ def watch(
     )
     write_report(folder / WATCH_FILE, report)
     return report
+
+
+def _check_gains(baseline: Path, gains: Gains) -> None:
+    """Raise ValueError if the runs in ``baseline`` were made with other ``gains``."""
+    report = read_model(
+        WatchReport, baseline / WATCH_FILE, "is not the report of a watch"
+    )
+    known = report.gains
+    differing = [
+        f"{path} is {gains.get(path, 'not set')} now and was "
+        f"{known.get(path, 'not set')}"
+        for path in sorted({*gains, *known})
+        if not math.isclose(gains.get(path, math.nan), known.get(path, math.nan))
+    ]
+    if differing:
+        raise ValueError(
+            f"{baseline} was recorded with other gains: {'; '.join(differing)}; record "
+            "a baseline with the present gains"
+        )
 
 
 def _runs(

@@ -81,6 +81,7 @@ class EmulatedStage:
     def __post_init__(self):
         self._random = np.random.default_rng(self.seed)
         self._one_at_a_time = threading.RLock()
+        self._one_request = threading.Lock()
         self._stop = threading.Event()
         self._walk, self._seen = 0.0, self.clock()
         self._check(self.safe_gains)
@@ -95,10 +96,15 @@ class EmulatedStage:
         self._restart()
 
     def run(self, reference: Float[np.ndarray, " samples"], gains: Gains) -> Record:
-        """Follow ``reference`` (um) with ``gains``, as ``Stage.run`` describes."""
+        """Follow ``reference`` (um) with ``gains``, as ``Stage.run`` describes.
+
+        Raises ValueError for a reference that is empty or not a row of numbers, too.
+        """
         reference = np.asarray(reference, dtype=float)
         if reference.ndim != 1 or not np.all(np.isfinite(reference)):
             raise ValueError("reference must be a row of numbers, in um")
+        if not reference.size:
+            raise ValueError("reference has 0 samples; give at least one, in um")
         with self._one_at_a_time:
             self.apply(gains)
             faults, self.faults = tuple(self.faults), ()
@@ -118,7 +124,6 @@ class EmulatedStage:
         """Set ``gains`` and hold the position."""
         with self._one_at_a_time:
             self._check(gains)
-            self._stop.clear()
             self._wait()
             self._set(replace(self._controller, _arrays(gains)))
 
@@ -128,10 +133,12 @@ class EmulatedStage:
 
     def safe(self) -> None:
         """Stop a run under way, set the safe gains and move to the safe voltage."""
-        self._stop.set()
-        with self._one_at_a_time:
-            self._retreat()
-            self._stop.clear()
+        # In turn, so that none clears the request of another one.
+        with self._one_request:
+            self._stop.set()
+            with self._one_at_a_time:
+                self._retreat()
+                self._stop.clear()
 
     @property
     def voltage(self) -> float:

@@ -58,7 +58,7 @@ class LearnReport(BaseModel):
     are set again at the end. Run 1 follows the ``reference`` itself. ``best`` is the
     index of the run with the smallest error, None if none was completed. ``verdict`` is
     "done", "stopped" (a run was stopped, or the user ended it: the safe gains are set)
-    or "lost" (no connection); "running" until then.
+    or "lost" (no connection, or the safe gains could not be set); "running" until then.
     """
 
     stage: str

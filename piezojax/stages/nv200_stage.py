@@ -55,6 +55,8 @@ FEEDFORWARD = ("pcf_x", "pcf_v", "pcf_a")
 NAMES = (*SINGLE, *FEEDFORWARD)
 """Gains of the stage: the fields of ``piezojax.control.NV200`` that can be sent."""
 
+ASKED = "it was asked to stop"
+
 FAULTS = {
     10: "the amplifier is too hot",
     11: "the actuator reports an error",
@@ -90,7 +92,8 @@ class NV200Stage:
         self, host: str, port: int = PORT, *, largest_error: float | None = None
     ):
         self._name = f"NV200 at {host}"
-        self._asked = False
+        self._asked, self._one_request = False, threading.Lock()
+        self._setting = asyncio.Lock()
         self._written: tuple[float, ...] = ()
         transport = _library("telnet_protocol").TelnetProtocol(host, port)
         self._device = _library("nv200_device").NV200Device(transport)
@@ -117,8 +120,8 @@ class NV200Stage:
             raise ValueError("reference must be a row of numbers, in um")
         if not 2 <= reference.size <= SAMPLES:
             raise ValueError(
-                f"the reference has {reference.size} samples; the NV200 records at "
-                f"most {SAMPLES} ({1e3 * SAMPLES * SAMPLE:g} ms)"
+                f"the reference has {reference.size} samples; the NV200 records 2 to "
+                f"{SAMPLES} ({1e3 * SAMPLES * SAMPLE:g} ms)"
             )
         low, high = self._range
         if np.min(reference) < low or np.max(reference) > high:
@@ -126,6 +129,8 @@ class NV200Stage:
                 f"the reference goes from {np.min(reference):.6g} to "
                 f"{np.max(reference):.6g} um; the range is {low:g} to {high:g} um"
             )
+        with self._one_request:  # a later one stops the run, also during ``apply``
+            self._asked = False
         self.apply(gains)
         return self._do(self._follow(reference))
 
@@ -139,8 +144,9 @@ class NV200Stage:
 
     def safe(self) -> None:
         """Stop a run under way, set the safe gains and move to the safe position."""
-        self._asked = True
-        self._do(self._retreat())
+        with self._one_request:
+            self._asked = True
+            self._do(self._retreat())
 
     def close(self) -> None:
         """End the connection; the stage keeps its gains."""
@@ -200,6 +206,10 @@ class NV200Stage:
 
     async def _set(self, texts: Mapping[str, str]) -> None:
         """Send the values that differ, and check that the device keeps them."""
+        async with self._setting:
+            await self._send(texts)
+
+    async def _send(self, texts: Mapping[str, str]) -> None:
         now = _numbers(await self._values())
         changed = {
             name: text
@@ -236,8 +246,14 @@ class NV200Stage:
         await self._set({n: _text(n, value) for n, value in self._safe_gains.items()})
         await self._move(self._safe_position)
 
+    async def _stop_if_asked(self) -> None:
+        """Raise StoppedError without samples before a run, if ``safe`` was called."""
+        if self._asked:
+            await self._retreat()
+            raise StoppedError(ASKED, *np.zeros((3, 0)))
+
     async def _follow(self, reference: np.ndarray) -> Record:
-        self._asked = False
+        await self._stop_if_asked()
         hold = math.ceil(reference.size / POINTS)
         low, high = self._range
         percent = 100.0 * (reference[::hold] - low) / (high - low)
@@ -246,6 +262,7 @@ class NV200Stage:
         await self._write_points(tuple(points.tolist()), hold)
         await asyncio.sleep(REST)
         await self._start_recorder(reference.size)
+        await self._stop_if_asked()
         await self._generator.start(cycles=1)
         reason = await self._watched(reference.size * SAMPLE)
         if not self._asked:  # else the stage moves to its safe position
@@ -256,10 +273,11 @@ class NV200Stage:
         samples = min(len(measured), len(voltage), reference.size)
         measured, voltage = measured[:samples], voltage[:samples]
         held = np.repeat(low + points * (high - low) / 100.0, hold)[:samples]
-        reason = reason or self._judged(held, measured, voltage)
+        asked = ASKED if self._asked else ""
+        reason = reason or asked or self._judged(held, measured, voltage)
         if reason:
-            if not self._asked:
-                await self._retreat()
+            # Also if ``safe`` does it: its commands may have come before those above.
+            await self._retreat()
             raise StoppedError(reason, held, measured, voltage)
         about = {"source": self._name, "reference": held}
         return Record(voltage, measured, SAMPLE, **about)
@@ -286,14 +304,15 @@ class NV200Stage:
         end = self._loop.time() + duration + MARGIN
         while await self._generator.is_running():
             if self._asked:
-                return "it was asked to stop"
+                await self._generator.stop()
+                return ASKED
             status = await self._device.read_int_value("stat")
             reasons = [why for bit, why in FAULTS.items() if status & (1 << bit)]
             if reasons or self._loop.time() > end:
                 await self._generator.stop()
                 return reasons[0] if reasons else "the run does not end"
             await asyncio.sleep(POLL)
-        return "it was asked to stop" if self._asked else ""
+        return ""
 
     def _judged(
         self, reference: np.ndarray, measured: np.ndarray, voltage: np.ndarray

@@ -61,6 +61,9 @@ class RemoteStage:
         """Stop a run under way, set the safe gains and move to the safe voltage."""
         with self._connect() as connection:
             _exchange(connection, self._timeout, {"do": "safe"})
+            # Without a goodbye the server would make the stage safe again, later.
+            with contextlib.suppress(LostError):
+                _exchange(connection, self._timeout, {"do": "bye"})
 
     def close(self) -> None:
         """End the connection; the stage keeps its gains and its position.

@@ -79,7 +79,8 @@ class TrialReport(BaseModel):
     ``gains`` are those tried, ``before`` all gains of the stage before the trial.
     ``verdict`` is "kept", "restored" (the gains from before are set again), "stopped"
     (the guard or the user stopped a run: the safe gains are set), or "lost" (no
-    connection). While the trial runs it is "running".
+    connection, or the safe gains could not be set). While the trial runs it is
+    "running".
     """
 
     stage: str
@@ -232,12 +233,16 @@ def abandoned(
     stage: Stage, error: BaseException
 ) -> tuple[Literal["stopped", "lost"], str]:
     """Make ``stage`` safe after ``error`` if possible; return verdict and alarm."""
-    with contextlib.suppress(LostError):
-        if not isinstance(error, LostError):
+    cause = _cause(error)
+    if not isinstance(error, LostError):
+        try:
             stage.safe()
-            return "stopped", f"{_cause(error)}; the safe gains of the stage are set"
+        except Exception as refusal:
+            cause = f"{cause}; the safe gains could not be set: {_cause(refusal)}"
+        else:
+            return "stopped", f"{cause}; the safe gains of the stage are set"
     return "lost", (
-        f"{_cause(error)}: nothing is known of the stage since; its own guard has to "
+        f"{cause}: nothing is known of the stage since; its own guard has to "
         "make it safe. Look at it before the next run"
     )
 

@@ -46,8 +46,8 @@ class RetuneReport(BaseModel):
     retuning, ``units`` the units of gains by path. The ``attempts`` begin with the
     gains that were on the stage. ``best`` is the index of the best attempt, None if no
     gains followed the references. ``verdict`` is "done", "stopped" (the user or a fault
-    ended the retuning: the safe gains are set) or "lost" (no connection); "running"
-    until then.
+    ended the retuning: the safe gains are set) or "lost" (no connection, or the safe
+    gains could not be set); "running" until then.
     """
 
     stage: str

@@ -66,7 +66,7 @@ def retune(
 
     Raises ValueError for a study with several axes or an amplifier, a plant that was
     not fitted, a stage that lacks a tuned gain or has another sample time, and a report
-    of another study; and as ``build`` and ``tune`` do.
+    of another study; and as ``build`` does.
     """
     progress, path = progress or Silent(), Path(study)
     description = load(path)
@@ -199,7 +199,8 @@ def _next_gains(
 
     The plant is fitted to the last runs. Stopped runs may contain effects that no plant
     explains, such as a limit. If the fit to them gives no such gains, the plant is
-    fitted to the other runs alone.
+    fitted to the other runs alone. A plant on which no gains can be tuned counts as one
+    that does not describe the runs.
     """
     report = bench.report
     best = None if report.best is None else report.attempts[report.best].gains
@@ -207,12 +208,16 @@ def _next_gains(
         file = bench.folder / f"model_{len(report.attempts)}.json"
         bench.progress.stage("fitting the plant to the runs")
         alarms = _fit_again(plant, records, bench.small(records), file)
+        runs = ", ".join(record.source for record in records)
         if alarms:
-            runs = ", ".join(record.source for record in records)
             report.notes.append(f"no plant describes {runs}: {alarms[0]}")
             continue
         study = _near(case, file, best, within)
-        outcome = tune(build(study, path), progress=bench.progress)
+        try:
+            outcome = tune(build(study, path), progress=bench.progress)
+        except ValueError as error:
+            report.notes.append(f"no gains suit the plant of {runs}: {error}")
+            continue
         if outcome.result.status == "interrupted":
             raise KeyboardInterrupt
         gains = scalars(outcome.controller)

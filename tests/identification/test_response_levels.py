@@ -16,6 +16,7 @@ from piezojax.identification.records.response import FrequencyResponse
 from piezojax.identification.records.response_file import read_response
 from piezojax.identification.response_levels import compare_levels
 from piezojax.identification.response_model import ResponseModel, ResponseReport
+from piezojax.report.response_pictures import measured_figure
 
 LINES = np.geomspace(50.0, 3000.0, 60)
 
@@ -127,7 +128,11 @@ def test_a_multisine_becomes_a_model_and_a_file_that_is_read(tmp_path, monkeypat
     ("line", "message"),
     [
         ("r.csv --skip 2 --unit nm/V", "--unit, --skip need --response"),
-        ("r.csv --response --period 9 --rate 9", "--period, --realisations and --skip"),
+        ("r.csv --response --period 9 --rate 9", "--period need a --method"),
+        (
+            "r.csv --response --rate 9 --segment 64 --skip 2",
+            "--skip, --segment need a --method",
+        ),
         ("r.csv --response", "a file of --response needs a --rate"),
         ("r.csv --response --method welch --unit m/V", "come from the record"),
         ("r.csv --response --rate 9 --amplitude 1,2", "has 2 values for 1 responses"),
@@ -143,3 +148,21 @@ def test_options_that_do_not_belong_together(tmp_path, monkeypatch, line, messag
     done = CliRunner().invoke(main, line.split())
     assert done.exit_code != 0
     assert message in done.output
+
+
+@pytest.mark.parametrize(
+    ("noise", "resolution", "label"),
+    [
+        (None, 0.0, "noise, 99 %"),
+        (None, 2.0, "noise and distortion, 99 %"),
+        (np.ones(LINES.size), 0.0, "noise and distortion, 99 %"),
+    ],
+)
+def test_both_panels_name_the_same_causes_of_the_variance(noise, resolution, label):
+    one = level(690.0, 0.03, 0.11)
+    of = {"variance": np.ones(LINES.size), "noise": noise, "resolution": resolution}
+    response = FrequencyResponse(LINES, one.response.values, **of)
+    gain, _, residual = measured_figure(response, one.fit, "a stage").axes
+    assert label in residual.get_legend_handles_labels()[1]
+    above = label.removesuffix(", 99 %") if noise is None else "noise of the mean"
+    assert above in gain.get_legend_handles_labels()[1]

@@ -145,6 +145,26 @@ def test_a_stage_is_compared_with_its_baseline(tmp_path):
     assert WatchReport.model_validate_json(text) == changed
 
 
+@pytest.mark.parametrize(
+    ("gains", "differing"),
+    [
+        ({"integral": 800.0}, "integral is 800.0 now and was 900.0;"),
+        ({"derivative": 0.0}, "derivative is 0.0 now and was not set;"),
+    ],
+)
+def test_a_baseline_of_other_gains_is_refused(tmp_path, gains, differing):
+    one = stage()
+    watched(one, tmp_path / "first", runs=6)
+    one.run = lambda *_: pytest.fail("the stage must not move")
+    motion = Motion("SIN2", MOTION, 1.0, 200, 1e-3)
+    options = {"baseline": tmp_path / "first", "runs": 1}
+    with pytest.raises(ValueError, match=f"with other gains: {differing} record"):
+        watch(one, GAINS | gains, motion, tmp_path, **options)
+    (tmp_path / "first" / WATCH_FILE).unlink()
+    with pytest.raises(ValueError, match=r"watch\.json: No such file"):
+        watch(one, GAINS, motion, tmp_path, **options)
+
+
 def test_a_stopped_run_is_a_change(tmp_path):
     one = stage()
     watched(one, tmp_path / "first", runs=6)

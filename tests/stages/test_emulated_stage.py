@@ -116,6 +116,38 @@ def test_safe_stops_a_run_from_another_thread():
     assert one.voltage == pytest.approx(LIMITS.retreat, abs=1e-9)
 
 
+def test_safe_stops_a_run_that_is_about_to_begin():
+    one = stage()
+    asked, check = threading.Thread(target=one.safe), one._check
+
+    def check_and_ask(gains):
+        asked.start()
+        assert one._stop.wait(5.0)
+        check(gains)
+
+    one._check = check_and_ask
+    with pytest.raises(StoppedError, match="it was asked to stop"):
+        one.run(REFERENCE, {})
+    asked.join()
+    assert one.gains() | SAFE == one.gains()
+    one._check = check
+    assert one.run(REFERENCE, {}).samples == len(REFERENCE)
+
+
+def test_no_request_to_stop_ends_another_one():
+    one, seen = stage(), []
+    one._retreat = lambda: seen.append(one._stop.is_set())
+    threads = [threading.Thread(target=one.safe) for _ in range(2)]
+    with one._one_at_a_time:
+        for thread in threads:
+            thread.start()
+        time.sleep(0.1)
+    for thread in threads:
+        thread.join()
+    assert seen == [True, True]
+    assert not one._stop.is_set()
+
+
 def test_time_goes_on_between_runs():
     now = iter([0.0, 0.0, 0.3])
     one = stage(drift=0.5, clock=lambda: next(now))
@@ -139,6 +171,13 @@ def test_gains_that_the_controller_cannot_have_are_refused(gains, message):
     assert one.gains()["integral"] == SAFE["integral"]
 
 
-def test_a_reference_that_is_no_row_of_numbers_is_refused():
-    with pytest.raises(ValueError, match="reference must be a row of numbers"):
-        stage().run(np.array([0.0, np.nan]), {})
+@pytest.mark.parametrize(
+    ("reference", "message"),
+    [
+        (np.array([0.0, np.nan]), "reference must be a row of numbers"),
+        (np.array([]), "reference has 0 samples; give at least one, in um"),
+    ],
+)
+def test_a_reference_that_is_no_row_of_numbers_is_refused(reference, message):
+    with pytest.raises(ValueError, match=message):
+        stage().run(reference, {})

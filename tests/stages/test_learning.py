@@ -1,14 +1,25 @@
 """A reference learned on a stage: what it reaches, and how it ends."""
 
 import json
+import shutil
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_runs import call, succeeded
-from stages.stage_in_tests import DT, REFERENCE, SAFE, lag, served, stage, write_study
+from stages.stage_in_tests import (
+    DT,
+    REFERENCE,
+    SAFE,
+    STUDY,
+    lag,
+    served,
+    stage,
+    write_study,
+)
 
 import piezojax as pj
+from piezojax.cli.on_stage import tuned_gains
 from piezojax.control import PID
 from piezojax.core.error_bound import ErrorBound
 from piezojax.hardware import Saturation, Sensor
@@ -232,6 +243,27 @@ def test_the_command_writes_a_page(tuned, tmp_path):
     assert "learning SIN2 on 127.0.0.1" in (out / "report.html").read_text()
     assert len(json.loads((out / "learn.json").read_text())["runs"]) <= 4
     assert len((out / "table.csv").read_text().splitlines()) == 51
+
+
+def test_the_named_study_leads_to_its_trajectories(tuned, tmp_path):
+    """Results that were moved do not find them."""
+    table = np.c_[DT * np.arange(len(REFERENCE)), REFERENCE]
+    head = "time_s,z_um"
+    np.savetxt(tmp_path / "scan.csv", table, delimiter=",", header=head, comments="")
+    scan = {"file": "scan.csv", "time": "time_s", "column": "z_um"}
+    references = STUDY["references"] | {"tune": ["scan"], "files": {"scan": scan}}
+    named, moved = write_study(tmp_path, references=references), tmp_path / "moved"
+    shutil.copytree(tuned, moved)
+    shutil.copy(named, moved / "study.toml")
+    result = moved / "result.json"
+    result.write_text(result.read_text().replace('"SIN2"', '"scan"'))
+    with pytest.raises(ValueError, match=r"scan\.csv"):
+        tuned_gains(moved)
+    motion, *_ = tuned_gains(moved, named)[2]
+    np.testing.assert_allclose(motion.reference, REFERENCE, atol=1e-9)
+    (tmp_path / "other").mkdir()
+    with pytest.raises(ValueError, match=r"study\.toml has no reference scan: it"):
+        tuned_gains(moved, write_study(tmp_path / "other"))
 
 
 def test_an_unknown_reference_is_refused(tuned):

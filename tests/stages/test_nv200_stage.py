@@ -3,6 +3,7 @@
 The library needs Python 3.12 or 3.13.
 """
 
+import asyncio
 import threading
 
 import numpy as np
@@ -136,8 +137,9 @@ def test_other_gains_are_refused(stage, gains, message):
     [
         (
             np.full(SAMPLES + 1, 40.0),
-            "has 6145 samples; the NV200 records at most 6144",
+            "has 6145 samples; the NV200 records 2 to 6144",
         ),
+        (np.array([40.0]), "has 1 samples; the NV200 records 2 to 6144"),
         (np.array([40.0, 81.0]), "from 40 to 81 um; the range is 0 to 80 um"),
         (np.array([40.0, np.nan]), "reference must be a row of numbers"),
     ],
@@ -178,6 +180,29 @@ def test_safe_stops_a_run(device, stage):
     assert stage.gains()["ki"] == 70.0
     assert device.values["set"] == pytest.approx(40.0)
     assert not device.running
+
+
+@pytest.mark.parametrize("moment", ["_set", "_start_recorder"])
+def test_safe_stops_a_run_that_is_about_to_begin(device, stage, monkeypatch, moment):
+    """While gains are set, or the waveform is written."""
+    whole, asked = getattr(stage, moment), threading.Thread(target=stage.safe)
+
+    async def ask(*arguments):
+        monkeypatch.setattr(stage, moment, whole)
+        asked.start()
+        while not stage._asked:
+            await asyncio.sleep(0.01)
+        return await whole(*arguments)
+
+    monkeypatch.setattr(stage, moment, ask)
+    with pytest.raises(StoppedError, match="it was asked to stop") as stop:
+        stage.run(short(REFERENCE), {"ki": 75.0})
+    asked.join(20.0)
+    assert stop.value.measured.size == 0
+    assert device.runs == 0
+    assert stage.gains()["ki"] == 70.0
+    assert device.values["set"] == pytest.approx(40.0)
+    assert stage.run(short(REFERENCE), {}).samples == 400
 
 
 @pytest.mark.parametrize(

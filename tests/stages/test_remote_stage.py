@@ -100,6 +100,16 @@ def test_safe_stops_a_run_through_the_socket():
         assert remote.gains()["integral"] == SAFE["integral"]
 
 
+def test_safe_is_carried_out_once():
+    """A second time could come after gains that were applied later."""
+    one, calls = stage(), []
+    one.safe = lambda: calls.append("safe")
+    with served(one) as address, closing(RemoteStage(address)) as remote:
+        remote.safe()
+        time.sleep(0.3)
+        assert calls == ["safe"]
+
+
 def test_a_killed_client_leaves_a_safe_stage():
     one = stage(speed=1.0)
     one.run(REFERENCE[:50], {})  # compiled

@@ -10,7 +10,8 @@ from stages.stage_in_tests import served
 
 import piezojax as pj
 from piezojax.core.serial import save
-from piezojax.stages import RemoteStage
+from piezojax.report.trial_report import nanometres
+from piezojax.stages import RemoteStage, StageServer
 from piezojax.stages.of_study import emulated_stage
 
 
@@ -122,6 +123,15 @@ def test_a_model_replaces_the_plant(tuned, tmp_path):
     )
 
 
+def test_ctrl_c_ends_the_emulator(tuned, monkeypatch):
+    def press(server):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(StageServer, "serve_forever", press)
+    printed = succeeded(call("emulate", tuned / "small.toml")).stdout
+    assert printed.endswith("Ctrl-C ends it\nthe emulator has ended\n")
+
+
 def watched(folder, address, *arguments):
     return call("watch", folder / "results", "--stage", address, *arguments)
 
@@ -148,3 +158,11 @@ def test_watch_names_the_references(tuned, tmp_path):
         result = watched(tuned, address, "--reference", "SIN5", "--out", tmp_path / "x")
     assert result.exit_code == 1
     assert "SIN50" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("error", "shown"),
+    [(None, "-"), (0.01234, "12.3 nm"), (0.9996, "1000 nm"), (1.234, "1234 nm")],
+)
+def test_large_errors_have_no_exponent(error, shown):
+    assert nanometres(error) == shown

@@ -1,12 +1,20 @@
 """A trial of gains on a stage: what is kept, what is restored, and what is left."""
 
+import contextlib
 import json
 
 import numpy as np
 import pytest
 from stages.stage_in_tests import DT, REFERENCE, SAFE, lag, stage
 
-from piezojax.stages import Fault, LostError, Motion, TrialReport, trial
+from piezojax.stages import (
+    Fault,
+    LostError,
+    Motion,
+    StageError,
+    TrialReport,
+    trial,
+)
 from piezojax.stages.try_gains import TRIAL_FILE
 
 GAINS = {"proportional": 1.0, "integral": 900.0}
@@ -136,6 +144,29 @@ def test_a_lost_connection_is_said(tmp_path):
     assert len(report.runs) == 2
     assert "Look at it before the next run" in report.alarms[0]
     assert read(tmp_path) == report
+
+
+@pytest.mark.parametrize(
+    "error", [StageError("the device keeps ki at 7"), KeyboardInterrupt()]
+)
+def test_a_stage_that_refuses_its_safe_gains_ends_with_an_alarm(tmp_path, error):
+    one, cause = stage(), str(error) or "KeyboardInterrupt"
+
+    def failing(*_):
+        raise error
+
+    def refusing():
+        raise StageError("the device keeps kp at 3")
+
+    one.run, one.safe = failing, refusing
+    ends = pytest.raises(KeyboardInterrupt)
+    with contextlib.nullcontext() if isinstance(error, StageError) else ends:
+        trial(one, GAINS, motions(1.0), tmp_path)
+    report = read(tmp_path)
+    assert report.verdict == "lost"
+    assert report.alarms[0].startswith(
+        f"{cause}; the safe gains could not be set: the device keeps kp at 3: nothing"
+    )
 
 
 def test_an_interruption_makes_the_stage_safe(tmp_path):

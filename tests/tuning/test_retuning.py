@@ -22,13 +22,18 @@ from stages.stage_in_tests import (
 
 import piezojax as pj
 from piezojax.core.paths import replace, scalars
+from piezojax.core.progress import Silent
 from piezojax.core.serial import save
 from piezojax.core.temporaries import claimed
 from piezojax.dynamics import FractionalDelay
-from piezojax.stages import Fault, LostError
+from piezojax.report.retune_report import write_retuning
+from piezojax.stages import Fault, LostError, TriedRun
+from piezojax.stages.run_files import run_file, save_samples
+from piezojax.stages.try_gains import Motion
 from piezojax.tuning import retuning
-from piezojax.tuning.attempts import RETUNE_FILE, RetuneReport
+from piezojax.tuning.attempts import RETUNE_FILE, Attempt, RetuneReport
 from piezojax.tuning.retuning import retune
+from piezojax.tuning.stage_bench import Bench
 
 GOOD = {"proportional": 4.0, "integral": 2500.0}
 WORSE = {"proportional": 0.5, "integral": 400.0}
@@ -53,7 +58,7 @@ def scripted(monkeypatch):
             studies.append(case.study)
             gains, predicted, *alarms = next(rows)
             if gains is None:
-                raise KeyboardInterrupt
+                raise predicted or KeyboardInterrupt
             controller = replace(case.loop.controller, gains)
             result = SimpleNamespace(
                 status="converged",
@@ -176,6 +181,21 @@ def test_gains_with_an_alarm_are_not_tried(study, tmp_path, scripted):
     assert report.attempts[1].verdict == "not tried"
     assert report.notes == ["model_1.json: not tried: the loop is unstable"]
     assert one.gains() == before
+
+
+def test_a_search_that_fails_leaves_the_best_gains_and_a_note(
+    study, tmp_path, scripted
+):
+    scripted((GOOD, 0.05), (None, ValueError("the loop diverges at all points tried")))
+    one = stage()
+    report = retune(study, one, out(tmp_path), runs=8)
+    assert report.verdict == "done"
+    files = "run_01.npz, run_02.npz, run_03.npz, run_04.npz"
+    assert report.notes == [
+        f"no gains suit the plant of {files}: the loop diverges at all points tried"
+    ]
+    assert one.gains() | GOOD == one.gains()
+    assert read(tmp_path / "out") == report
 
 
 @pytest.mark.parametrize("changed", [{}, {"derivative_filter": 100.0}])
@@ -471,6 +491,52 @@ def test_the_command_writes_a_page_and_goes_on(study, scripted):
     page = (folder / "report.html").read_text()
     assert "Errors by attempt, and the first and the best run" in page
     assert "attempts: rms error with noise" in page
+
+
+def test_a_run_without_a_measured_error_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr(Bench, "run", lambda *_: TriedRun(reference="SIN1", share=1.0))
+    report = RetuneReport(stage="one", title="", study_sha256="", before=GOOD)
+    motion = Motion("SIN1", np.sin(np.arange(500.0)), 0.1)
+    attempt = Attempt(gains=GOOD)
+    Bench(stage(), [motion], tmp_path, report, 9, Silent()).measure(attempt)
+    assert attempt.verdict == "stopped"
+    assert attempt.why.endswith(": the run has no error of the reading, measured_um")
+
+
+@pytest.mark.parametrize(
+    ("later", "shown"),
+    [
+        (0.02, {"first and best run": "10 nm"}),
+        (None, {"first and best run": "10 nm"}),
+        (0.005, {"first run": "10 nm", "best run": "5 nm"}),
+    ],
+)
+def test_the_picture_names_the_best_run(tmp_path, later, shown):
+    runs = []
+    for i, error in enumerate((0.01, later)):
+        save_samples(run_file(tmp_path, i), *np.ones((3, 9)))
+        runs.append(
+            TriedRun(
+                reference="SIN1",
+                share=1.0,
+                measured_um=error,
+                file=run_file(tmp_path, i).name,
+            )
+        )
+    report = RetuneReport(
+        stage="one",
+        title="two runs",
+        study_sha256="",
+        before=GOOD,
+        runs=runs,
+        attempts=[Attempt(gains=GOOD, measured_um=0.01)],
+        best=0,
+    )
+    (picture,) = write_retuning(report, tmp_path, DT).values()
+    _, _, *panels = [panel.get_title().strip() for panel in picture.axes]
+    assert dict(zip(panels[::2], panels[1::2], strict=True)) == {
+        f"SIN1, {run}": f"Error: {error} rms" for run, error in shown.items()
+    }
 
 
 def test_the_command_ends_with_the_alarm(study):
