@@ -1,11 +1,19 @@
 """report.html: the tables of the terminal as HTML, alarms first, texts quoted."""
 
+import re
+from pathlib import Path
+
 from page_reader import Reader
 from rich.table import Table
 from rich.text import Text
 
+import piezojax
 from piezojax.report.live_figures import LiveFigures
-from piezojax.report.page import Page, page_html, table_html
+from piezojax.report.page import PICTURES, Page, page_html, table_html
+from piezojax.report.summary_tables import reproduction_table
+from piezojax.reproduction.cell import Cell
+from piezojax.reproduction.rates import FIGURE
+from piezojax.reproduction.summary import summarise
 
 
 def test_a_table_is_that_of_the_terminal():
@@ -34,3 +42,24 @@ def test_alarms_come_first_and_texts_are_quoted(tmp_path):
     assert "<pre>title = &quot;a &lt; b&quot;</pre>" in text
     # Sections without content are left out.
     assert "Pictures" not in found.headings
+
+
+def test_a_table_in_parts_shows_all_its_numbers():
+    cells = [Cell("7-4", "Z", f"c{i}", "um", 1.0 + i, 2.0 + i) for i in range(4)]
+    found = Reader(
+        table_html(reproduction_table("7-4", cells, summarise(cells)["7-4"]))
+    )
+    assert found.captions[0] == "Table 7-4: paper / simulation in um"
+    for cell in cells:
+        assert f"{cell.paper:.4f} / {cell.sim:.4f}" in found.cells
+
+
+def test_every_picture_has_a_caption():
+    sources = Path(piezojax.__file__).parent.rglob("*.py")
+    text = "".join(path.read_text(encoding="utf-8") for path in sources)
+    names = {*re.findall(r'(?<!f)"([\w-]+\.png)"', text), f"{FIGURE}.png"}
+    assert {"tracking.png", "cells.png"} < names
+    assert names == set(PICTURES)
+    # A metric and a number stand in the other names; the caption is that name.
+    computed = {"{FIGURE}.png", "{name}.png", "singular_values_{number}.png"}
+    assert {*re.findall(r'f"([^"]+\.png)"', text)} == computed

@@ -52,9 +52,10 @@ def init_body(
     fields: Fields,
     precision: Precision,
     rounding: Sequence[Slot] = (),
-) -> str:
-    """Return the body of ``init``, which computes the state at rest.
+) -> tuple[str, bool]:
+    """Return the body of ``init``, and whether it computes with the parameters.
 
+    It sets the state at rest, that of the exported parameters if it solves equations.
     The states ``rounding`` start at 0.
     """
     dynamic, static = eqx.partition(system, eqx.is_array)
@@ -62,12 +63,13 @@ def init_body(
     def init(dynamic, start):
         return eqx.combine(dynamic, static).init(start)
 
-    names = expressions(fields.starts, "")
+    names, general = expressions(fields.starts, ""), True
     try:
         graph, outputs = trace(init, dynamic, interface.start)
         names = [*expressions(fields.parameters, "parameters->"), *names]
     except NotScalarError:
         # ``init`` solves equations: they are solved here for the exported parameters.
+        general = False
         graph, outputs = trace(system.init, interface.start)
     for slot in rounding:
         outputs.append(np.full(slot.size, graph.constant(0.0, "real")))
@@ -77,7 +79,7 @@ def init_body(
         graph, _flat(outputs), lambda place: names[place], precision
     )
     lines += _assignments(fields, outputs, expression, precision)
-    return "\n".join([*_unused(fields.starts), *lines])
+    return "\n".join([*_unused(fields.starts), *lines]), general
 
 
 def step_bodies(

@@ -17,7 +17,7 @@ from ..core.system import System, resolve
 from ..scalar.c_source import PRECISIONS
 from ..scalar.rolled import ROLLED, constant_array
 from .c_bodies import Fields, StepBodies, init_body, step_bodies
-from .c_templates import HEADER, PREPARED_TYPE, SOURCE
+from .c_templates import FIXED_REST, HEADER, PREPARED_TYPE, SOURCE
 from .driven import Driven
 from .slots import PREPARED, Interface, Slot, expressions, slots, type_of
 
@@ -70,6 +70,16 @@ class CProject:
     def _step(self) -> StepBodies:
         return step_bodies(
             self.system, self.state, self.interface, self._all_fields, self.precision
+        )
+
+    @cached_property
+    def _init(self) -> tuple[str, bool]:
+        return init_body(
+            self.system,
+            self.interface,
+            self._all_fields,
+            self.precision,
+            self.rounding,
         )
 
     @property
@@ -192,6 +202,7 @@ class CProject:
             parameters=fields,
             state=self._fields([*self.states, *self.rounding], lambda slot: ""),
             output=output,
+            rest="" if self._init[1] else FIXED_REST,
             units=", ".join(f"{k} in {v}" for k, v in units.items()) or "as simulated",
             **signatures,
         )
@@ -204,13 +215,7 @@ class CProject:
             name=self.name,
             set=self._defaults(),
             checks=self._checks(),
-            init_body=init_body(
-                self.system,
-                self.interface,
-                self._all_fields,
-                self.precision,
-                self.rounding,
-            ),
+            init_body=self._init[0],
             prepare_body=self._step.prepare,
             step_body=self._step.step,
             **signatures,

@@ -41,7 +41,7 @@ typedef struct {{
 /* Return 0, or the number (from 1) of the first parameter outside its limits. */
 {check};
 
-/* Set the state at rest under these signals. */
+/* Set the state at rest under these signals{rest}. */
 {init};
 
 /* Advance one sample. */
@@ -49,6 +49,10 @@ typedef struct {{
 
 #endif
 """
+
+FIXED_REST = """, for the exported parameters. The
+   state solves equations that this file does not hold: changed parameters do not move
+   it, so that the loop does not begin at rest with them"""
 
 PREPARED_TYPE = """\
 /* Numbers that {name}_prepare computes from the parameters. */

@@ -86,7 +86,8 @@ def export(
     Raises ValueError for a ``folder`` in use, an unknown ``to``, a System with alarms
     (``about.unsafe``) or a controller without margins (``about.judged``) unless
     ``accept_unsafe``, a controller without limits, and a System that cannot be written
-    in scalar operations. An FMU, a linear model and biquads need a sampling rate; an
+    in scalar operations, and fewer ``samples`` than 1, for a plant than twice ``HELD``.
+    An FMU, a linear model and biquads need a sampling rate; an
     FMU also needs a C compiler.
     """
     if to not in FORMS:
@@ -104,6 +105,9 @@ def export(
     if to == "vendor":
         saved = None if before is None else Path(before)
         return write_vendor(system, Path(folder), name or kind, about, saved)
+    least = 2 * HELD if kind == "plant" else 1
+    if samples < least:
+        raise ValueError(f"samples is {samples}; a {kind} needs at least {least}")
     draw = np.random.default_rng(seed)
     if kind == "plant":
         system, interface, inputs = _plant(system, axes, about, samples, draw)

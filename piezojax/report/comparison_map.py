@@ -130,7 +130,7 @@ def perturbed_text(comparison: ComparisonResult) -> str:
         line = f"lowest on held-out plants at {float(rate) / 1000:g} kHz: {best}"
         if errors:
             name, error = min(errors.items(), key=lambda item: item[1])
-            line += f", {error / least:.2f}x below the next, {name}"
+            line += f"; the next, {name}, has {error / least:.2f} times its error"
         lines.append(line)
     return "\n".join(lines)
 

@@ -5,11 +5,17 @@ from rich.table import Table
 from ..tuning.drive import HIGH, Drive
 
 
-def drive_table(drive: tuple[dict[str, Drive], dict[str, Drive]], rate: float) -> Table:
+def drive_table(
+    drive: tuple[dict[str, Drive], dict[str, Drive]],
+    rate: float,
+    *,
+    has_capacitance: bool,
+) -> Table:
     """Return the figures of the voltage at the piezo before and after tuning, by axis.
 
     ``rate`` is the sampling rate, Hz. Figures that need a capacitance are left out
-    without one. On a stage with several axes, V stands for the unit of the commands.
+    unless ``has_capacitance``. On a stage with several axes, V stands for the unit of
+    the commands.
     """
     table = Table(title="voltage at the piezo on held-out noise, worst reference")
     table.add_column("figure")
@@ -19,9 +25,9 @@ def drive_table(drive: tuple[dict[str, Drive], dict[str, Drive]], rate: float) -
         before = drive[0][axis]
         shown = "" if len(drive[1]) == 1 else f"{axis}, "
         for field, (meaning, unit) in _DRIVE.items():
-            values = [getattr(figures, field) for figures in (before, after)]
-            if field in _NEED_CAPACITANCE and values == [None, None]:
+            if field in _NEED_CAPACITANCE and not has_capacitance:
                 continue
+            values = [getattr(figures, field) for figures in (before, after)]
             cells = (
                 "diverges" if value is None else f"{value:.3g}" for value in values
             )

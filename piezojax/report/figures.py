@@ -48,6 +48,11 @@ def figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
+def plain_number(value: float) -> str:
+    """Return ``value``, at least 0, in three digits or more, without an exponent."""
+    return f"{value:.3g}" if value < 999.5 else f"{value:.0f}"
+
+
 def add_title(picture: Figure, title: str) -> None:
     """Put ``title`` above all panels, with long lines wrapped to the width."""
     width = int(11.0 * picture.get_figwidth())

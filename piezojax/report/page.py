@@ -33,18 +33,26 @@ PICTURES = {
     "stability.png": "Open loop, sensitivities and margins",
     "robustness.png": "Errors and limited figures on the perturbed plants",
     "hysteresis.png": "Hysteresis of the stage, and error over reference",
+    "coupling.png": "Errors of all axes with one driven, before and after tuning",
+    "contour.png": "Contours and their errors, before and after tuning",
     "fit.png": "Record, model and residual",
     "response.png": "Measured frequency response and its model",
+    "amplitudes.png": "Modes by amplitude of the input",
     "comparison.png": "Errors of the compared models or controllers",
     "validation.png": "The model on the other records",
     "excitation.png": "Voltages to record",
     "trial.png": "References, readings and errors on the stage",
     "retune.png": "Errors by attempt, and the first and the best run on the stage",
+    "learn.png": "Errors by run, and the learned reference",
     "watch.png": "The stage in each run, beside the baseline",
     "limit.png": "Errors beside the limit of linear control",
     "structures.png": "Errors by the number of notches",
     "pareto.png": "Error against the limited figure",
     "convergence.png": "Objective over the steps of the search",
+    "baselines.png": "Best objective of each method over wall time",
+    "cells.png": "Simulated against printed values",
+    "figure-4-10.png": "Simulated errors by sampling rate",
+    "calibration.png": "Simulated against printed values, fitted and held out",
 }
 """Captions of the pictures by file, in the order of the page; others follow."""
 
@@ -123,7 +131,14 @@ def page_html(page: Page, folder: Path, live: LiveFigures) -> str:
 
 
 def table_html(table: Table) -> str:
-    """Return a printed table as HTML, with its title, header, rows and caption."""
+    """Return a printed table as HTML, with its title, header, rows and caption.
+
+    A grid of tables becomes these tables, one below the other.
+    """
+    cells = [cell for column in table.columns for cell in column.cells]
+    inner = [cell for cell in cells if isinstance(cell, Table)]
+    if inner:
+        return "".join(table_html(each) for each in inner)
     sides = ["right" if c.justify == "right" else "left" for c in table.columns]
     header = [_plain(column.header) for column in table.columns]
     cells = [[_plain(cell) for cell in column.cells] for column in table.columns]

@@ -137,8 +137,7 @@ def _draw_measured(gain: Axes, phase: Axes, response: FrequencyResponse) -> None
     phase.fill_between(hertz, low, high, **shade)
     level = distortion_level(response)
     if response.noise is None:
-        of = "noise and distortion" if response.resolution else "noise"
-        label, deviation = of, np.sqrt(response.variance)
+        label, deviation = _part_of(response), np.sqrt(response.variance)
     else:
         label, deviation = "noise of the mean", np.sqrt(response.noise)
     gain.plot(hertz, deviation, color=REFERENCE, lw=0.7, label=label)
@@ -160,9 +159,15 @@ def _draw_residual(ax: Axes, response: FrequencyResponse, fit: ModalFit) -> None
         CONFIDENCE * fit.deviation,
         color=BEFORE,
         lw=1.0,
-        label="noise, 99 %" if response.noise is None else "noise and distortion, 99 %",
+        label=f"{_part_of(response)}, 99 %",
     )
     ax.legend(fontsize=7.5)
+
+
+def _part_of(response: FrequencyResponse) -> str:
+    """Return the causes of the errors that the variance of ``response`` holds."""
+    both = response.noise is not None or response.resolution
+    return "noise and distortion" if both else "noise"
 
 
 def levels_figure(found: ResponseLevels) -> Figure:

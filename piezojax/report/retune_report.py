@@ -27,7 +27,7 @@ from .trial_report import draw_run, nanometres, stage_gains_table
 
 RETUNE_PICTURE = "retune.png"
 
-FIRST = "first run"
+FIRST, BEST, BOTH = "first run", "best run", "first and best run"
 
 
 def write_retuning(report: RetuneReport, folder: Path, dt: float) -> Pictures:
@@ -53,7 +53,7 @@ def _figure(report: RetuneReport, folder: Path, dt: float) -> Figure:
         error.set(xlabel="time (s)", title=f"Error: {shown}")
         _, _, voltage = load_samples(folder / run.file)
         time = dt * np.arange(len(voltage))
-        colour = BEFORE if title == FIRST else AFTER
+        colour = AFTER if title == BEST else BEFORE
         drive.plot(time, voltage, color=colour, lw=0.8, label=title)
     drive.set(ylabel="voltage (V)", xlabel="time (s)")
     legend_above(drive)
@@ -62,14 +62,17 @@ def _figure(report: RetuneReport, folder: Path, dt: float) -> Figure:
 
 
 def _first_and_best(report: RetuneReport) -> dict[str, TriedRun]:
-    """Return the first run of a reference, and the best of its later runs, if any."""
+    """Return the first and the best run of the first reference by their titles.
+
+    There is one run if the first is the best, or if none was completed.
+    """
     runs = [run for run in report.runs if run.reference != PROBE]
     same = [run for run in runs if run.reference == runs[0].reference]
-    measured = [run for run in same[1:] if run.measured_um is not None]
-    found = {FIRST: same[0]}
-    if measured:
-        found["best run"] = min(measured, key=lambda run: run.measured_um or 0.0)
-    return found
+    measured = [run for run in same if run.measured_um is not None]
+    if not measured:
+        return {FIRST: same[0]}
+    best = min(measured, key=lambda run: run.measured_um or 0.0)
+    return {BOTH: best} if best is same[0] else {FIRST: same[0], BEST: best}
 
 
 def _draw_attempts(panel: Axes, report: RetuneReport) -> None:

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from ..analysis.constraints import CONSTRAINTS
+from ..solve.problem import FAILED_LOSS
 from ..tuning.result import FrontPoint, Perturbed, Result
 from .figures import AFTER, BEFORE, add_title, figure, plain_tick_labels
 
@@ -43,12 +44,12 @@ def front_table(front: Sequence[FrontPoint], constraint: str) -> Table:
     for name in (f"{constraint} limit", "reached", "error, nm", "objective"):
         table.add_column(name, justify="right", no_wrap=True)
     for point in front:
-        error = point.geomean_rms_um
+        error, failed = point.geomean_rms_um, point.loss >= FAILED_LOSS
         table.add_row(
             f"{point.limit:.4g}",
             _number(point.value) + ("" if point.kept else ", missed"),
-            "-" if error is None else f"{1e3 * error:.2f}",
-            f"{point.loss:.3f}",
+            "diverges" if error is None else f"{1e3 * error:.2f}",
+            "failed" if failed else f"{point.loss:.3f}",
         )
     return table
 
@@ -97,13 +98,15 @@ def front_figure(
     """Draw the error against the limited figure at each point of a Pareto front."""
     if not front or constraint is None:
         return None
-    picture = figure(4.6, 3.4)
-    panel = picture.subplots()
     drawn = [
         (p.value, 1e3 * p.geomean_rms_um, p.kept)
         for p in front
         if p.geomean_rms_um is not None and p.value is not None
     ]
+    if not drawn:
+        return None
+    picture = figure(4.6, 3.4)
+    panel = picture.subplots()
     for kept, style, label in ((True, "o-", "limit kept"), (False, "x", "missed")):
         points = [(x, y) for x, y, inside in drawn if inside is kept]
         if points:

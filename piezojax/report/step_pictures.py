@@ -8,7 +8,15 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from ..tuning.step_tests import StepResult, StepRun
-from .figures import AFTER, BEFORE, REFERENCE, add_title, figure, legend_above
+from .figures import (
+    AFTER,
+    BEFORE,
+    REFERENCE,
+    add_title,
+    figure,
+    legend_above,
+    plain_number,
+)
 
 Loops = tuple[Mapping[str, Any], Mapping[str, Any]]
 """Values by step, before and after tuning."""
@@ -48,11 +56,12 @@ def steps_table(steps: Loops) -> Table:
 
 
 def _worse(steps: Sequence[StepResult], name: str, factor: float) -> str:
+    if any(step.overshoot is None for step in steps):
+        return "diverges"
     values = [getattr(step, name) for step in steps]
     if any(value is None for value in values):
         return "never"
-    worst = factor * max(values)
-    return f"{worst:.3g}" if worst < 1e3 else f"{worst:.0f}"
+    return plain_number(factor * max(values))
 
 
 def steps_figure(runs: Loops, steps: Loops, title: str) -> Figure:

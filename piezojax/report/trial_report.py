@@ -18,6 +18,7 @@ from .figures import (
     add_title,
     figure,
     legend_above,
+    plain_number,
     plot_style,
     write,
 )
@@ -157,4 +158,4 @@ def stage_gains_table(
 
 def nanometres(value_um: float | None) -> str:
     """Return a length in nm, "-" if it is not known."""
-    return "-" if value_um is None else f"{1e3 * value_um:.3g} nm"
+    return "-" if value_um is None else f"{plain_number(1e3 * value_um)} nm"

@@ -50,7 +50,11 @@ def tuning_page(outcome: Outcome, surrogate: GainSurrogate | str | None = None) 
         result.on_response and response_table(result.on_response),
         stability.reports and following_table(stability),
         outcome.steps[1] and steps_table(outcome.steps),
-        drive_table(outcome.drive, study.rate),
+        drive_table(
+            outcome.drive,
+            study.rate,
+            has_capacitance=study.actuator.capacitance is not None,
+        ),
         sliding_text(result),
         result.constraints and constraints_table(result),
         front,

@@ -51,19 +51,19 @@ def write_results(outcome: Outcome, folder: Path) -> Pictures:
     logs = {trace: _axis_logs(study, trace, runs[trace.run]) for trace in shown}
     with plot_style():
         pictures = {
-            "tracking": tracking_figure(outcome, logs),
-            "hysteresis": hysteresis_figure(outcome, logs),
-            "convergence": convergence_figure(outcome) if result.history else None,
-            "coupling": coupling_figure(outcome.coupling, result.heading),
-            "contour": contour_figure(
+            "tracking.png": tracking_figure(outcome, logs),
+            "hysteresis.png": hysteresis_figure(outcome, logs),
+            "convergence.png": convergence_figure(outcome) if result.history else None,
+            "coupling.png": coupling_figure(outcome.coupling, result.heading),
+            "contour.png": contour_figure(
                 study, result.heading, contour_errors(study, runs)
             ),
-            "steps": steps_figure(outcome.step_runs, outcome.steps, result.heading)
+            "steps.png": steps_figure(outcome.step_runs, outcome.steps, result.heading)
             if outcome.steps[1]
             else None,
-            "structures": structures_figure(result.structures, result.heading),
-            "robustness": perturbed_figure(result.perturbed, result.heading),
-            "pareto": front_figure(
+            "structures.png": structures_figure(result.structures, result.heading),
+            "robustness.png": perturbed_figure(result.perturbed, result.heading),
+            "pareto.png": front_figure(
                 result.front,
                 study.pareto.constraint if study.pareto else None,
                 result.heading,
@@ -71,7 +71,7 @@ def write_results(outcome: Outcome, folder: Path) -> Pictures:
         }
         for name, picture in pictures.items():
             if picture:
-                drawn |= write(picture, folder / f"{name}.png")
+                drawn |= write(picture, folder / name)
     return drawn
 
 

@@ -97,6 +97,15 @@ def test_a_linear_model_starts_at_rest_for_the_exported_parameters(tmp_path):
     assert status == 0, text
 
 
+def test_the_header_says_that_changed_parameters_leave_a_solved_start(tmp_path):
+    model = pj.core.axes.Packed(
+        pj.dynamics.StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], 5e-5)
+    )
+    for system, said in ((model, True), (PLANTS["p753"](), False)):
+        header, *_ = pj.export(system, tmp_path / f"{said}", about=ABOUT)
+        assert ("changed parameters do not" in header.read_text()) == said
+
+
 @compiled
 def test_a_filter_that_amplifies_rounding_errors_has_a_wider_tolerance(tmp_path):
     about = pj.About(judged=["fine"], reference_ranges=[(-9.0, 9.0)] * 3)
@@ -315,6 +324,18 @@ def test_a_controller_that_no_study_judged_is_refused_unless_accepted(tmp_path):
 def test_bad_options_are_refused(options, message, tmp_path):
     with pytest.raises(ValueError, match=message):
         pj.export(CONTROLLERS["p753_pid"](), tmp_path / "c", about=ABOUT, **options)
+
+
+@pytest.mark.parametrize(
+    ("system", "samples", "message"),
+    [
+        (PLANTS["p753"], 99, "samples is 99; a plant needs at least 100"),
+        (CONTROLLERS["p753_pid"], 0, "samples is 0; a controller needs at least 1"),
+    ],
+)
+def test_too_few_samples_are_refused(system, samples, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        pj.export(system(), tmp_path / "c", about=ABOUT, samples=samples)
 
 
 class Sorted(pj.System):

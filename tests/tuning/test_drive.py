@@ -123,7 +123,7 @@ def test_the_figures_are_in_the_file_and_in_the_table(outcome, tmp_path):
     assert (written.drive_before, written.drive) == outcome.drive
     plain = json.loads((tmp_path / "result.json").read_text(encoding="utf-8"))
     assert set(plain["drive"]["piezo"]) == set(Drive.model_fields)
-    table = drive_table(outcome.drive, 2e4)
+    table = drive_table(outcome.drive, 2e4, has_capacitance=True)
     titles = list(table.columns[0].cells)
     assert titles[1] == "above 2000 Hz, rms"
     assert len(titles) == 6
@@ -133,9 +133,20 @@ def test_the_figures_are_in_the_file_and_in_the_table(outcome, tmp_path):
 
 def test_figures_that_need_a_capacitance_are_omitted_without_one():
     drive = Drive(noise_rms_V=0.1, high_frequency_rms_V=None, slew_rms_V_per_s=2.0)
-    table = drive_table(({"x": drive, "y": drive}, {"x": drive, "y": drive}), 1e4)
+    both = {"x": drive, "y": drive}
+    table = drive_table((both, both), 1e4, has_capacitance=False)
     assert list(table.columns[0].cells)[::3] == [
         "x, noise on a constant reference, rms",
         "y, noise on a constant reference, rms",
     ]
     assert list(table.columns[1].cells)[:3] == ["0.1", "diverges", "2"]
+
+
+def test_currents_of_diverged_loops_are_in_the_table():
+    lost = {
+        "piezo": Drive(
+            noise_rms_V=None, high_frequency_rms_V=None, slew_rms_V_per_s=None
+        )
+    }
+    table = drive_table((lost, lost), 1e4, has_capacitance=True)
+    assert list(table.columns[2].cells) == ["diverges"] * 6
