@@ -88,7 +88,8 @@ def by_evidence(records: Sequence[Record], train: slice) -> list[Record]:
 
 def dynamics_of(record: Record) -> LinearDynamics:
     """Return the linear dynamics that a record of one input and one output shows."""
-    return linear_dynamics(record.input, record.output, record.dt)
+    found = linear_dynamics(record.input, record.output, record.dt)
+    return found._replace(input_unit=record.input_unit)
 
 
 def shown_dynamics(records: Sequence[Record], train: slice) -> LinearDynamics:

@@ -22,8 +22,9 @@ from piezojax.identification.residuals.correlation import (
     autocorrelation,
     cross_correlation,
 )
+from piezojax.identification.residuals.coverage import unseen_in
 from piezojax.identification.residuals.peaks import unmodelled_peaks
-from piezojax.identification.residuals.report import residual_report
+from piezojax.identification.residuals.report import model_faults, residual_report
 
 RATE = 10e3
 DT = 1.0 / RATE
@@ -189,6 +190,37 @@ def test_amplitudes_of_the_validation_part_alone_are_named():
         input[HALVES[1]].max(),
     )
     assert any("beyond that of the training part" in text for text in warnings)
+
+
+def test_every_input_and_every_record_counts_in_the_coverage():
+    wide = INPUT.copy()
+    wide[HALVES[1]] = 40.0 + 2.0 * (wide[HALVES[1]] - 40.0)
+    new = np.concatenate([excitation(1, 200.0), excitation(2, 1500.0)])
+    new = new[SAMPLES // 2 : 3 * SAMPLES // 2]
+    inputs = [np.stack([INPUT, other], axis=1) for other in (wide, new)]
+    run = answer(STAGE, INPUT)[:, None]
+    records = [Record(x, run, DT, input_units=("V", "N")) for x in inputs]
+    found, _, warnings = residual_report([records[0]], [run], *HALVES)
+    assert found.unseen.input == 1
+    assert any("part's input 1 goes from" in t and " N, beyond" in t for t in warnings)
+    narrow = Record(excitation(3, 200.0), run, DT)
+    second = Record(new, run, DT)
+    assert unseen_in([narrow, second], *HALVES).band_Hz is not None
+    # Training covers what it holds in any record.
+    trained = Record(INPUT, run, DT)
+    assert unseen_in([second, trained], *HALVES).band_Hz is None
+
+
+def test_a_peak_is_found_in_any_record():
+    slow, fast = excitation(1, 100.0), excitation(2)
+    records = [Record(x, noisy(answer(STAGE, x)), DT) for x in (slow, fast)]
+    runs = [answer(SLOW, x)[:, None] for x in (slow, fast)]
+    (alone,) = model_faults(records[1:], runs[1:], HALVES[1]).peaks
+    (peak,) = model_faults(records, runs, HALVES[1]).peaks
+    assert peak == alone
+    short = records[0].until(SAMPLES // 2)  # without a validation part
+    runs = [runs[1], runs[0][: short.samples]]
+    assert model_faults([records[1], short], runs, HALVES[1]).peaks == [alone]
 
 
 def test_a_narrow_record_has_an_alarm_with_its_band():

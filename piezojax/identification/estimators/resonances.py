@@ -69,7 +69,8 @@ class LinearDynamics(NamedTuple):
     ``delay`` is in excess of the one sample between input and output. ``slope`` is that
     of the output over the full range of the input, below the resonances. Both are None
     if no dynamics could be identified. ``whitening`` is the filter of the errors.
-    ``slew`` is the slew rate of the input (its unit per s), None if it shows no limit.
+    ``slew`` is the slew rate of the input, whose unit is ``input_unit``, per s; None if
+    it shows no limit.
     """
 
     modes: tuple[Resonance, ...] = ()
@@ -78,6 +79,7 @@ class LinearDynamics(NamedTuple):
     slope: float | None = None
     whitening: tuple[float, ...] = ()
     slew: float | None = None
+    input_unit: str = "V"
 
     def __str__(self) -> str:
         texts = [
@@ -87,7 +89,7 @@ class LinearDynamics(NamedTuple):
         ]
         texts += [f"a lag of {1e3 * lag:.2g} ms" for lag in self.lags]
         if self.slew is not None:
-            texts.append(f"a slew rate of {self.slew:.3g} V/s")
+            texts.append(f"a slew rate of {self.slew:.3g} {self.input_unit}/s")
         return ", ".join(texts)
 
 

@@ -36,12 +36,14 @@ class Coverage(BaseModel):
 class Unseen(BaseModel):
     """Frequencies (Hz) and inputs of the validation part that training does not cover.
 
-    ``band_Hz`` goes from the lowest to the highest new line, ``input_range`` is that of
-    the validation part. Each is None if training covers it.
+    ``band_Hz`` goes from the lowest to the highest new line of all inputs.
+    ``input_range`` is that of the first ``input`` (from 0) that leaves its training
+    range, over the validation parts that leave it. Each is None if training covers it.
     """
 
     band_Hz: tuple[float, float] | None  # noqa: N815
     input_range: tuple[float, float] | None
+    input: int = 0
 
 
 def coverage_of(records: Sequence[Record], bound: ErrorBound | None) -> Coverage:
@@ -58,28 +60,74 @@ def coverage_of(records: Sequence[Record], bound: ErrorBound | None) -> Coverage
     )
 
 
-def unseen_in(input: np.ndarray, dt: float, train: slice, validate: slice) -> Unseen:
-    """Return the frequencies and inputs in ``validate`` that ``train`` lacks."""
+def unseen_in(records: Sequence[Record], train: slice, validate: slice) -> Unseen:
+    """Return the frequencies and inputs in ``validate`` that ``train`` lacks.
+
+    ``train`` covers what it holds in any of the ``records``.
+    """
+    dt, parts = records[0].dt, (train, validate)
+    found = [
+        _unseen(number, [record.inputs[:, number] for record in records], dt, *parts)
+        for number in range(records[0].inputs.shape[1])
+    ]
+    bands = [one.band_Hz for one in found if one.band_Hz is not None]
+    beyond = next((one for one in found if one.input_range is not None), found[0])
+    return Unseen(
+        band_Hz=(min(low for low, _ in bands), max(high for _, high in bands))
+        if bands
+        else None,
+        input_range=beyond.input_range,
+        input=beyond.input,
+    )
+
+
+def _unseen(
+    number: int, inputs: Sequence[np.ndarray], dt: float, train: slice, validate: slice
+) -> Unseen:
+    """Return what ``validate`` holds of an input [samples] and ``train`` lacks."""
     import scipy.signal  # takes long to import
 
-    parts = [input[train], input[validate]]
-    size = 2 ** int(np.log2(max(8, min(part.size for part in parts) // 4)))
+    trained, validated = ([x[part] for x in inputs] for part in (train, validate))
+    longest = min(max(x.size for x in parts) for parts in (trained, validated))
+    size = 2 ** int(np.log2(max(8, longest // 4)))
     frequency = np.fft.rfftfreq(size, dt)
-    powers = [
-        scipy.signal.welch(part, nperseg=size, detrend="linear")[1] for part in parts
-    ]
-    strong = powers[1] > STRONG * powers[1].max()
+    known, powers = (
+        [
+            scipy.signal.welch(x, nperseg=size, detrend="linear")[1]
+            for x in parts
+            if x.size >= size
+        ]
+        for parts in (trained, validated)
+    )
     # A line next to one that was trained on is leakage of the window.
-    trained = np.convolve(powers[0], np.ones(5), mode="same")
-    new = np.flatnonzero(strong & (trained < NEW * powers[1]))
-    low, high = parts[0].min(), parts[0].max()
-    beyond = BEYOND * (high - low)
-    outside = (parts[1] < low - beyond) | (parts[1] > high + beyond)
+    known = [np.convolve(power, np.ones(5), mode="same") for power in known]
+    covered = np.max([np.zeros(frequency.size), *known], axis=0)
+    new = np.flatnonzero(
+        np.any(
+            [
+                (power > STRONG * power.max()) & (covered < NEW * power)
+                for power in [np.zeros(frequency.size), *powers]
+            ],
+            axis=0,
+        )
+    )
+    low = min(x.min() for x in trained if x.size)
+    high = max(x.max() for x in trained if x.size)
+    margin = BEYOND * (high - low)
+    outside = [
+        x
+        for x in validated
+        if x.size and np.mean((x < low - margin) | (x > high + margin)) > OFTEN
+    ]
     return Unseen(
         band_Hz=(float(frequency[new[0]]), float(frequency[new[-1]]))
         if new.size
         else None,
-        input_range=(float(parts[1].min()), float(parts[1].max()))
-        if outside.mean() > OFTEN
+        input_range=(
+            float(min(x.min() for x in outside)),
+            float(max(x.max() for x in outside)),
+        )
+        if outside
         else None,
+        input=number,
     )

@@ -1,5 +1,7 @@
 """Resonances that a model lacks, from its relative error by frequency."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from pydantic import BaseModel
 
@@ -26,6 +28,9 @@ noise on its side of the peak."""
 
 ENOUGH = 4
 """Least number of lines on a side of a peak."""
+
+NEAR = 0.8, 1.25
+"""Ratios of frequency between which lines belong to one peak."""
 
 MOST = 3
 """Largest number of peaks in a report."""
@@ -54,11 +59,14 @@ def unmodelled_peaks(found: RelativeError) -> list[Peak]:
     large = np.flatnonzero((found.lower > LEAST) & (amplitude > VISIBLE))
     for i in large[np.argsort(found.lower[large], kind="stable")[::-1]]:
         ratio = frequency / frequency[i]
-        near = (ratio > 0.8) & (ratio < 1.25)
+        near = (ratio > NEAR[0]) & (ratio < NEAR[1])
         flank = sure[near] & (error[near] >= FLANK * error[i])
         if near[kept].any() or not flank.any():
             continue
-        sides = (ratio > 0.5) & (ratio <= 0.8), (ratio >= 1.25) & (ratio < 2.0)
+        sides = (
+            (ratio > 0.5) & (ratio <= NEAR[0]),
+            (ratio >= NEAR[1]) & (ratio < 2.0),
+        )
         levels = [_level(found, side) for side in sides if side.sum() >= ENOUGH]
         if levels and error[i] > SHARP * max(levels):
             kept.append(int(i))
@@ -68,6 +76,18 @@ def unmodelled_peaks(found: RelativeError) -> list[Peak]:
                 Peak(frequency_Hz=float(frequency[top]), times_gain=float(error[top]))
             )
     return peaks[:MOST]
+
+
+def joined_peaks(each: Sequence[Sequence[Peak]]) -> list[Peak]:
+    """Return the peaks of several records; of those at one place, the largest."""
+    if len(each) == 1:
+        return list(each[0])
+    kept: list[Peak] = []
+    for peak in sorted((p for one in each for p in one), key=lambda p: -p.times_gain):
+        ratios = [peak.frequency_Hz / other.frequency_Hz for other in kept]
+        if not any(NEAR[0] < ratio < NEAR[1] for ratio in ratios):
+            kept.append(peak)
+    return kept[:MOST]
 
 
 def _level(found: RelativeError, side: np.ndarray) -> float:

@@ -1,6 +1,7 @@
 """Residual analysis of a fit: report and warnings."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from ..records.record import Record
 from .bound import RelativeError, error_bound, relative_error
 from .correlation import Correlation, autocorrelation, cross_correlation
 from .coverage import Coverage, Unseen, coverage_of, unseen_in
-from .peaks import LEAST, VISIBLE, Peak, unmodelled_peaks
+from .peaks import LEAST, VISIBLE, Peak, joined_peaks, unmodelled_peaks
 
 OTHER_GAIN = 1.25
 """Least factor between the motions of stage and model that raises a warning."""
@@ -88,7 +89,7 @@ def residual_report(
         ],
         peaks=faults.peaks,
         coverage=coverage_of(records, faults.bound),
-        unseen=unseen_in(records[0].inputs[:, 0], records[0].dt, train, validate),
+        unseen=unseen_in(records, train, validate),
         error_bound=faults.bound,
     )
     return (
@@ -97,7 +98,7 @@ def residual_report(
         [
             *faults.warnings,
             *_coverage_warnings(report, records[0].dt),
-            *_unseen_warnings(report),
+            *_unseen_warnings(report.unseen, records[0].input_units),
         ],
     )
 
@@ -110,8 +111,8 @@ def model_faults(
     Bound and peaks are those of ``ResidualReport``. The bound holds for the whole
     records; everything else holds over ``part``.
     """
-    bound, relative = _relative(records, runs, part)
-    peaks = [] if relative is None else unmodelled_peaks(relative)
+    bound, errors = _relative(records, runs, part)
+    peaks = joined_peaks([unmodelled_peaks(error) for error in errors])
     gross = [peak for peak in peaks if peak.times_gain > GROSS]
     return Faults(
         bound,
@@ -119,7 +120,7 @@ def model_faults(
         [*_peak_warnings(gross)],
         [
             *_peak_warnings(peak for peak in peaks if peak.times_gain <= GROSS),
-            *([] if peaks else _response_warnings(relative)),
+            *([] if peaks else _response_warnings(errors)),
             *_gain_warnings(records, runs, part),
         ],
     )
@@ -127,22 +128,28 @@ def model_faults(
 
 def _relative(
     records: Sequence[Record], runs: Sequence[np.ndarray], validate: slice
-) -> tuple[ErrorBound | None, RelativeError | None]:
-    """Return the bound over the whole records and the error over validation.
+) -> tuple[ErrorBound | None, list[RelativeError]]:
+    """Return the bound over the whole records and the error of each over validation.
 
-    Both are None for records of several channels, and for short or constant ones.
+    A record whose validation part is short or constant has no error. The bound is None
+    if there is none, for records of several channels, and for short or constant ones.
     """
     channels = {(r.inputs.shape[1], r.outputs.shape[1]) for r in records}
     if channels != {(1, 1)}:
-        return None, None
+        return None, []
+    errors = []
     single = [run[:, 0] for run in runs]
+    for record, run in zip(records, single, strict=True):
+        if record.samples > validate.start:
+            with suppress(ValueError):
+                errors.append(relative_error(record, run, validate))
+    if not errors:
+        return None, []
     try:
-        return (
-            error_bound(records, single, slice(0, max(r.samples for r in records))),
-            relative_error(records[0], single[0], validate),
-        )
+        whole = slice(0, max(record.samples for record in records))
+        return error_bound(records, single, whole), errors
     except ValueError:
-        return None, None
+        return None, []
 
 
 def _peak_warnings(peaks: Iterable[Peak]) -> Iterator[str]:
@@ -155,22 +162,27 @@ def _peak_warnings(peaks: Iterable[Peak]) -> Iterator[str]:
         )
 
 
-def _response_warnings(found: RelativeError | None) -> Iterator[str]:
-    """Yield a warning if the error exceeds the model's gain in most of an octave."""
-    if found is None:
-        return
+def _response_warnings(errors: Iterable[RelativeError]) -> Iterator[str]:
+    """Yield a warning if an error exceeds the model's gain in most of an octave."""
+    wrong = [place for error in errors if (place := _wrong_from(error)) is not None]
+    if wrong:
+        yield (
+            f"from {min(wrong):.4g} Hz on the model is wrong by more than "
+            "its own gain: its dynamics are too simple; fit a model with a mode, a "
+            "lag or a delay (--model ...+mode+lag+delay) before tuning"
+        )
+
+
+def _wrong_from(found: RelativeError) -> float | None:
+    """Return the frequency (Hz) from which the model is wrong, None if it is not."""
     seen = found.gain > VISIBLE * found.gain[0]
     wrong = found.sure & (found.lower > LEAST) & seen
     for i in np.flatnonzero(wrong):
         ratio = found.frequency / found.frequency[i]
         octave = (ratio >= 1.0) & (ratio < 2.0)
         if octave.sum() >= 4 and wrong[octave].mean() > WIDE:
-            yield (
-                f"from {found.frequency[i]:.4g} Hz on the model is wrong by more than "
-                "its own gain: its dynamics are too simple; fit a model with a mode, a "
-                "lag or a delay (--model ...+mode+lag+delay) before tuning"
-            )
-            return
+            return float(found.frequency[i])
+    return None
 
 
 def _gain_warnings(
@@ -208,8 +220,7 @@ def _coverage_warnings(report: ResidualReport, dt: float) -> Iterator[str]:
         )
 
 
-def _unseen_warnings(report: ResidualReport) -> Iterator[str]:
-    unseen = report.unseen
+def _unseen_warnings(unseen: Unseen, units: Sequence[str]) -> Iterator[str]:
     if unseen.band_Hz is not None:
         low, high = unseen.band_Hz
         yield (
@@ -219,9 +230,10 @@ def _unseen_warnings(report: ResidualReport) -> Iterator[str]:
         )
     if unseen.input_range is not None:
         low, high = unseen.input_range
+        name = "input" if len(units) == 1 else f"input {unseen.input}"
         yield (
-            f"the validation part's input goes from {low:.3g} to {high:.3g} "
-            f"{report.coverage.input_unit}, beyond that of the training part: the "
+            f"the validation part's {name} goes from {low:.3g} to {high:.3g} "
+            f"{units[unseen.input]}, beyond that of the training part: the "
             "model was not fitted there; choose parts of the same range "
             "(--train, --validate)"
         )
