@@ -124,16 +124,27 @@ def test_extremes_cover_the_whole_run():
     run = record()
     found = figures(Extremes(), run)
     swing = np.ptp(run.reference)
-    beyond = np.max(run.displacement) - np.max(run.reference)
+    beyond = max(
+        np.max(run.displacement) - np.max(run.reference),
+        np.min(run.reference) - np.min(run.displacement),
+    )
     np.testing.assert_allclose(found.peak_slew, np.abs(np.diff(run.voltage)).max())
     np.testing.assert_allclose(found.overshoot, beyond / swing, rtol=1e-12)
     assert beyond > 0.0
 
 
-def test_there_is_no_overshoot_below_the_reference_or_at_rest():
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_overshoot_is_counted_on_both_sides(side):
     run = record()
-    below = run._replace(displacement=run.reference - 1.0)
-    assert figures(Extremes(), below).overshoot == 0.0
+    swing = np.ptp(run.reference)
+    moved = run._replace(displacement=run.reference + side)
+    assert figures(Extremes(), moved).overshoot == pytest.approx(1.0 / swing)
+
+
+def test_there_is_no_overshoot_within_the_references_or_at_rest():
+    run = record()
+    within = run._replace(displacement=0.9 * run.reference + 0.5)
+    assert figures(Extremes(), within).overshoot == 0.0
     still = run._replace(reference=jnp.full(SAMPLES, 1.0))
     assert figures(Extremes(), still).overshoot == 0.0
 

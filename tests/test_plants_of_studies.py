@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import json
 import tomllib
 
 import numpy as np
@@ -20,8 +21,8 @@ from piezojax.identification.residual_record import (
     residual_path,
 )
 from piezojax.report.fit_pictures import write_model
-from piezojax.study import Study, as_toml, build, sha256_of
-from piezojax.study.schema import AxesTable
+from piezojax.study import Study, as_toml, build, sha256_of, study_schema
+from piezojax.study.schema import _FILES, AxesTable
 from piezojax.tuning.data import make_data
 from piezojax.tuning.make_result import _residual_notes
 from piezojax.tuning.response_margins import margins_on_response
@@ -111,6 +112,53 @@ def test_a_study_keeps_its_records_and_its_hash_in_another_folder():
     assert sha256_of(moved) == sha256_of(study)
     renamed = study_of(**tomllib.loads(as_toml(study, lambda file: f"{file}_2")))
     assert sha256_of(renamed) != sha256_of(study)
+
+
+def texts_in(content):
+    if isinstance(content, dict | list):
+        inner = content.values() if isinstance(content, dict) else content
+        return [text for each in inner for text in texts_in(each)]
+    return [content] if isinstance(content, str) else []
+
+
+@pytest.mark.parametrize(
+    "plant",
+    [
+        {"record": ["d/a", "d/b"], "check": ["d/c"]},
+        {"records": "d/a", "check": "d/b"},
+        {"records": ["d/a"]},
+        {"response": "d/a"},
+        {"file": "d/a"},
+    ],
+)
+def test_every_file_of_a_study_is_renamed(plant):
+    file = {"file": "d/x", "column": "z"}
+    references = STUDY["references"] | {"tune": ["ref"], "files": {"ref": file}}
+    study = study_of(
+        plant=plant,
+        controller={"file": "d/x"},
+        references=references,
+        sensor={"measured_noise": file},
+        disturbance={"output": file, "input": file},
+        ensemble={"standard_errors": "d/x"},
+        beside={"other": {"controller": {"file": "d/x"}}},
+    )
+    found = texts_in(tomllib.loads(as_toml(study, lambda name: f"../{name}")))
+    assert sum("d/" in text for text in found) == 7 + len(texts_in(plant))
+    assert not [text for text in found if text.startswith("d/")]
+    inner = study_of(**tomllib.loads(as_toml(study, lambda name: f"e/{name}")))
+    assert sha256_of(inner) == sha256_of(study)
+
+
+def test_no_field_of_a_study_with_a_file_is_forgotten():
+    def paths_in(table):
+        for key, each in table.get("properties", {}).items():
+            if '"format": "path"' in json.dumps(each):
+                yield key
+
+    schema = study_schema()
+    found = {key for t in (schema, *schema["$defs"].values()) for key in paths_in(t)}
+    assert found == _FILES
 
 
 def test_the_residual_is_that_of_every_record(case):

@@ -838,6 +838,16 @@ def test_a_front_has_at_least_two_limits(study, refusal):
     assert "pareto.limits" in refusal(limit | {"pareto": front | {"limits": [20.0]}})
 
 
+@pytest.mark.parametrize("name", ["rise_time", "settling_time"])
+def test_a_limit_beyond_the_run_of_a_step_is_refused(study, refusal, name):
+    # No run of 0.05 s shows that a step takes at most 0.06 s.
+    assert load(study({"constraints": {name: 0.04}})).limits[name] == 0.04
+    message = f"is 0.06 s for the {name}; a step is simulated for 0.04995 s only"
+    assert message in refusal({"constraints": {name: 0.06}})
+    front = {"constraint": name, "limits": [0.02, 0.06]}
+    assert message in refusal({"constraints": {name: 0.04}, "pareto": front})
+
+
 @pytest.mark.parametrize("settle", [0.05, 0.06])
 def test_settling_for_the_whole_run(refusal, settle):
     message = f"settle is {settle:g} s; it must be below the duration, 0.05 s"

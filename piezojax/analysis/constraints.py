@@ -242,8 +242,8 @@ CONSTRAINTS: dict[str, Constraint] = {
         "at most",
         "extremes",
         lambda found, dt: _largest(found.overshoot),
-        meaning="Largest displacement above the highest reference, as a share of the "
-        "reference's range",
+        meaning="Largest displacement above the highest reference or below the lowest, "
+        "as a share of the reference's range",
     ),
     "gain_margin": Constraint(
         "dB",

@@ -40,8 +40,8 @@ class StepFigures(NamedTuple):
 
     If the displacement does not settle within the run, the settling time is longer than
     the run and falls as the displacement ends nearer to the reference. If it does not
-    reach 90 % of the height, the rise time is extrapolated likewise; if it does not
-    even reach 10 %, the rise time is 0.8 of the run.
+    reach 90 % of the height, the rise time is longer than the run and falls as the
+    largest displacement comes nearer to it.
     """
 
     rise_time: Array
@@ -99,13 +99,14 @@ def figures_of(
     """Return the figures of a run with ``step_reference``; see ``step_figures``."""
     height = ends[1] - ends[0]
     # The reference steps at sample 1.
-    share = (displacement[1:] - ends[0]) / height
-    share = jnp.nan_to_num(share, nan=1e6, posinf=1e6, neginf=-1e6)
+    found = (displacement[1:] - ends[0]) / height
+    share = jnp.nan_to_num(found, nan=1e6, posinf=1e6, neginf=-1e6)
     error = share - 1.0
     last = max(1, round(LAST * error.size))
     band = jnp.maximum(noise / jnp.abs(height), 1e-12)
     return StepFigures(
-        dt * (_reached(share, END) - _reached(share, START)),
+        # A run reaches nothing by diverging.
+        dt * _rise(jnp.nan_to_num(found, nan=-1e6, posinf=-1e6, neginf=-1e6)),
         dt * _settled(error, BAND),
         dt * _settled(error, FINE),
         dt * _settled(error, band),
@@ -114,16 +115,25 @@ def figures_of(
     )
 
 
+def _rise(share: Float[Array, " samples"]) -> Array:
+    """Return the time, in samples, from ``START`` to ``END``."""
+    highest = jnp.max(share)
+    # A step that never reaches END has no time from START that could be extrapolated.
+    never = share.size * (1.0 + END - highest)
+    rise = _reached(share, END) - _reached(share, START)
+    return jnp.where(highest >= END, rise, never)
+
+
 def _reached(share: Float[Array, " samples"], level: float) -> Array:
-    """Return the time, in samples, at which ``share`` first reaches ``level``."""
-    above = share >= level
-    at = jnp.argmax(above)
+    """Return the time, in samples, at which ``share`` first reaches ``level``.
+
+    The result has no meaning if it never does.
+    """
+    at = jnp.argmax(share >= level)
     here, before = share[at], jnp.where(at > 0, share[at - 1], 0.0)
     rises = here > before
     part = (here - level) / jnp.where(rises, here - before, 1.0)
-    place = at - jnp.where(rises, part, 0.0)
-    never = share.size * (1.0 + level - jnp.max(share))
-    return jnp.where(jnp.any(above), place, never)
+    return at - jnp.where(rises, part, 0.0)
 
 
 def _settled(error: Float[Array, " samples"], band: ScalarLike) -> Array:

@@ -91,8 +91,9 @@ class ExtremeFigures(NamedTuple):
     """Extremes of one run of a loop.
 
     ``peak_slew`` is the largest change of the voltage between two samples, V.
-    ``overshoot`` is the excess of the displacement over the highest reference, as a
-    share of the range of the reference; it is 0 for a constant reference.
+    ``overshoot`` is the excess of the displacement over the highest reference or below
+    the lowest one, whichever is larger, as a share of the range of the reference; it is
+    0 for a constant reference.
     """
 
     peak_slew: Scalar
@@ -108,6 +109,7 @@ class Extremes(Metric):
             "slew": zero,
             "last": jnp.asarray(jnp.nan),
             "highest": least,
+            "lowest": -least,
             "top": least,
             "bottom": -least,
         }
@@ -119,13 +121,16 @@ class Extremes(Metric):
             "slew": jnp.maximum(total["slew"], jnp.abs(change)),
             "last": output.voltage,
             "highest": jnp.maximum(total["highest"], output.displacement),
+            "lowest": jnp.minimum(total["lowest"], output.displacement),
             "top": jnp.maximum(total["top"], output.reference),
             "bottom": jnp.minimum(total["bottom"], output.reference),
         }
 
     def result(self, total: State) -> ExtremeFigures:
         swing = total["top"] - total["bottom"]
-        beyond = total["highest"] - total["top"]
+        above = total["highest"] - total["top"]
+        below = total["bottom"] - total["lowest"]
+        beyond = jnp.maximum(above, below)
         moves = swing > 0.0
         overshoot = jnp.maximum(beyond, 0.0) / jnp.where(moves, swing, 1.0)
         return ExtremeFigures(total["slew"], jnp.where(moves, overshoot, 0.0))

@@ -43,6 +43,11 @@ class RateRange(RangeTable):
         both = self.lower is not None and self.upper is not None
         if both == (self.factor is not None):
             raise ValueError("give lower and upper, or a factor")
+        if self.factor is not None and self.scale not in (None, "log"):
+            raise ValueError(
+                f"scale is {self.scale!r}; bounds of a factor are searched on the "
+                "scale 'log': leave scale out, or give lower and upper"
+            )
         return self
 
     def at(self, start: float, rate: float, path: str) -> dict[str, Any]:
@@ -113,10 +118,14 @@ class ComparisonStudy(Table):
 
     @model_validator(mode="after")
     def _distinct_rates(self) -> "ComparisonStudy":
-        for name, table in self.controllers.items():
-            for rates in (self.rates, table.rates or ()):
-                if len(set(rates)) < len(rates):
-                    raise ValueError(f"a rate of {name} is listed twice")
+        lists = {"rates": self.rates} | {
+            f"controllers.{name}.rates": table.rates or ()
+            for name, table in self.controllers.items()
+        }
+        for key, rates in lists.items():
+            for rate in rates:
+                if rates.count(rate) > 1:
+                    raise ValueError(f"{key}: {rate:g} Hz is listed twice")
         return self
 
 

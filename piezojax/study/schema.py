@@ -3,10 +3,10 @@
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import tomli_w
-from pydantic import Field, field_validator, model_validator
+from pydantic import AliasChoices, Field, field_validator, model_validator
 
 from ..analysis.constraints import CONSTRAINTS, limits_of
 from ..core.plain import read_plain, shown
@@ -16,6 +16,7 @@ from ..signals import waveforms as signals
 from ..solve.optimisers import GAUSS_NEWTON, METHODS
 from .ensemble_table import EnsembleTable
 from .file_tables import NoiseFile, TrajectoryTable, check_trajectory_name
+from .plant_tables import RecordPlant, ResponsePlant
 from .stage_tables import Actuator, DisturbanceTable, SensorTable
 from .structure_table import StructuresTable
 from .sweep_table import SweepTable, require_quoted_paths
@@ -399,6 +400,24 @@ class Study(Table):
         return self
 
     @model_validator(mode="after")
+    def _timed(self) -> "Study":
+        # A step is as long as the references, and changes at its second sample.
+        length = (round(self.references.duration * self.rate) - 1) * self.dt
+        limits = [(f"constraints.{name}", name, x) for name, x in self.limits.items()]
+        if self.pareto:
+            name = self.pareto.constraint
+            limits += [("pareto.limits", name, x) for x in self.pareto.limits]
+        for key, name, limit in limits:
+            kind = CONSTRAINTS[name]
+            timed = kind.source == "steps" and kind.unit == "s"
+            if timed and limit > length * (1.0 + 1e-9):
+                raise ValueError(
+                    f"{key} is {limit:g} s for the {name}; a step is simulated for "
+                    f"{length:g} s only: lower the limit or raise references.duration"
+                )
+        return self
+
+    @model_validator(mode="after")
     def _swept(self) -> "Study":
         known = (*self.references.tune, *self.references.unseen)
         for name in self.sweep.references if self.sweep else ():
@@ -486,7 +505,27 @@ class Study(Table):
         return {"": reference}
 
 
-_FILES = frozenset({"file", "record", "response", "check"})
+def _file_keys(kind: Any) -> frozenset[str]:
+    """Return the keys with paths in the tables of a type, and in those within them."""
+    if not (isinstance(kind, type) and issubclass(kind, Table)):
+        return frozenset().union(*map(_file_keys, get_args(kind)))
+    found: set[str] = set()
+    for name, field in kind.model_fields.items():
+        found |= _file_keys(field.annotation)
+        if _is_path(field.annotation):
+            alias = field.validation_alias
+            names = (
+                alias.choices if isinstance(alias, AliasChoices) else [alias or name]
+            )
+            found |= {str(each) for each in names}
+    return frozenset(found)
+
+
+def _is_path(kind: Any) -> bool:
+    return kind is Path or any(map(_is_path, get_args(kind)))
+
+
+_FILES = _file_keys(Study | RecordPlant | ResponsePlant)
 """Keys of a study whose texts name files."""
 
 

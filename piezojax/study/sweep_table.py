@@ -75,7 +75,7 @@ class SweepTable(Table):
     """Recorded metrics: figures of a run, and the peak ``sensitivity_peak`` of
     |1/(1+L)|."""
     every: Count | None = None
-    """Record each N-th sample of displacement and voltage; without this key none."""
+    """Record every N-th sample of displacement and voltage; without this key none."""
     chunk: Count | None = None
     """Number of points that are simulated and stored at a time; without this key it is
     chosen from the length of a run."""

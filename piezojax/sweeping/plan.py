@@ -71,19 +71,19 @@ class Plan:
             self.shape = (table.samples,)
             self._sampled = _samples(table, self.axes, study.seed)
         self.points = math.prod(self.shape)
-        most = max(1, int(CHUNK_BYTES / bytes_of_point(study)))
+        most = max(1, int(CHUNK_BYTES / bytes_of_point(case)))
         block = BLOCK if jax.default_backend() == "cpu" else ACCELERATED_BLOCK
         if table.chunk is not None:
             block = min(block, max(BLOCK, table.chunk))
         self.width = min(block, self.points, most)
-        self.chunk = self._chunk(study, table, most)
+        self.chunk = self._chunk(case, table, most)
         self.chunks = -(-self.points // self.chunk)
 
-    def _chunk(self, study: Study, table: SweepTable, most: int) -> int:
+    def _chunk(self, case: Case, table: SweepTable, most: int) -> int:
         if table.chunk is not None:
             wanted = table.chunk
         else:
-            lane_steps = runs_of_point(study) * samples_of(study)
+            lane_steps = runs_of_point(case) * samples_of(case.study)
             wanted = max(CHUNK_LANE_STEPS / lane_steps, self.points / MOST_CHUNKS)
             wanted = min(wanted, most, self.points / FEWEST_CHUNKS)
         return max(1, math.ceil(wanted / self.width)) * self.width
@@ -142,10 +142,11 @@ def plants_of(case: Case) -> dict[str, System]:
     return dict(case.plants) or {own: case.loop.plant}
 
 
-def runs_of_point(study: Study) -> int:
+def runs_of_point(case: Case) -> int:
     """Return the number of simulations for each point."""
+    study = case.study
     plants = len(sweep_table(study).plants) or 1
-    stretches = STRETCHES if "record" in study.plant else 1
+    stretches = 1 if case.residual is None else STRETCHES
     return plants * len(references_of(study)) * study.holdout_draws * stretches
 
 
@@ -154,13 +155,13 @@ def samples_of(study: Study) -> int:
     return round(study.references.duration * study.rate)
 
 
-def bytes_of_point(study: Study) -> int:
+def bytes_of_point(case: Case) -> int:
     """Return the size of the results of a point, bytes."""
-    table = sweep_table(study)
+    study, table = case.study, sweep_table(case.study)
     numbers = len(table.metrics)
     if table.every:
         numbers += len(TRAJECTORIES) * -(-samples_of(study) // table.every)
-    return 8 * runs_of_point(study) * numbers * study.axis_count
+    return 8 * runs_of_point(case) * numbers * study.axis_count
 
 
 def _axes(case: Case, table: SweepTable) -> list[Axis]:

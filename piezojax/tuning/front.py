@@ -13,7 +13,7 @@ from ..solve.search_state import SearchState
 from ..study import Case
 from .evaluator import Evaluator
 from .objective import Objective
-from .result import ConstraintOutcome, FrontPoint
+from .result import ConstraintOutcome, FrontPoint, number
 
 Place = tuple[np.ndarray, FrontPoint]
 """Gains as a point of the unit box, and the point of the front with those gains."""
@@ -61,7 +61,7 @@ def trace_front(
             value=reached.value,
             loss=state.loss,
             kept=state.violation <= TOLERANCE,
-            geomean_rms_um=float(np.exp(np.mean(np.log(rms)))),
+            geomean_rms_um=number(np.exp(np.mean(np.log(rms)))),
             gains={
                 path: float(value)
                 for path, value in case.space.named(as_array(unit)).items()

@@ -30,10 +30,7 @@ def model_alarms(
     if fitted:
         yield from about.unsafe
         if bound is None:
-            yield (
-                "the record gives no bound on the error of the fitted plant: use a "
-                "longer record with one input and one output"
-            )
+            yield _no_bound(about)
     if bound is not None and "after" in stability.loops:
         yield from _error_alarm(bound, limit, stability)
 
@@ -59,6 +56,22 @@ def worst_peak(
         if reached > worst:
             worst, at = reached, float(curves.frequency[peak])
     return worst, at
+
+
+def _no_bound(about: About) -> str:
+    """Return the alarm of a plant without a bound on the error of its model."""
+    inputs, outputs = len(about.input_ranges), len(about.residual_rms)
+    if max(inputs, outputs) <= 1:
+        return (
+            "the record gives no bound on the error of the fitted plant: use a longer "
+            "record whose voltage and displacement move throughout"
+        )
+    return (
+        f"the fitted plant has {inputs} inputs and {outputs} outputs, and no bound on "
+        "the error of its model: bounds are known for one input and one output only, "
+        "so the margins hold for the model alone; give the model's uncertainty in "
+        "[ensemble], and raise the gains on the stage in small steps"
+    )
 
 
 def _error_alarm(

@@ -90,7 +90,8 @@ class FrontPoint(BaseModel):
 
     ``kept`` tells whether the gains keep the limit. ``value`` is the worst value of the
     limited figure on the plants of the objective, ``loss`` the objective, and
-    ``geomean_rms_um`` the geometric mean of the errors on the nominal plant.
+    ``geomean_rms_um`` the geometric mean of the errors on the nominal plant, None if a
+    run diverges.
     """
 
     limit: float

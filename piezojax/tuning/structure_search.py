@@ -31,7 +31,7 @@ AROUND = np.linspace(-4.0, 4.0, 33)
 WIDTHS = 0.2, 0.6
 """Damping ratios of the poles of a notch from which a search starts."""
 
-SHALLOWEST = 0.05
+DEEPEST = 0.05
 """Least depth of a notch, its gain at the centre, from which a search starts."""
 
 Tune = Callable[[Case, np.ndarray | None, Progress], Outcome]
@@ -225,7 +225,7 @@ def _starts(
 
     def notch(number: int, mode: PlantMode, width: float) -> dict[str, float]:
         where = f"{place}.filter.{NOTCH.format(number)}"
-        depth = min(max(mode.damping / width, SHALLOWEST), OFF)
+        depth = min(max(mode.damping / width, DEEPEST), OFF)
         return {
             f"{where}.frequency": mode.frequency,
             f"{where}.damping": width,

@@ -41,6 +41,14 @@ def around(controller, gain=1.0, delay=0):
     return pj.Feedback(controller, pj.series(**parts), limits, pj.hardware.Sensor(0.0))
 
 
+def test_a_state_that_only_integrates_its_input_has_margins():
+    # The pole of 1 + g / (z - 1) is 1 - g; it leaves the unit circle at g = 2.
+    found = report_of(LinearLoop(np.eye(1), np.ones(1), np.array([0.5]), DT))
+    assert found.gain_margin == pytest.approx(4.0)
+    assert LinearLoop(np.eye(1), np.ones(1), np.ones(1), DT).integrates()
+    assert not LinearLoop(0.9 * np.eye(1), np.ones(1), np.ones(1), DT).integrates()
+
+
 def pid(name):
     return pj.control.PID(*PIDS[name], 50.0, dt=DT)
 

@@ -62,10 +62,34 @@ def test_an_unsettled_step_has_settling_time_beyond_the_run():
     assert 1_000 * DT < short.rise_time < far.rise_time
 
 
+@pytest.mark.parametrize(
+    "share",
+    [
+        np.full(1_000, -0.1),
+        np.full(1_000, 0.05),
+        np.concatenate([np.zeros(999), [0.89]]),
+        np.full(1_000, 0.8999),
+    ],
+)
+def test_a_step_below_nine_tenths_rises_longer_than_the_run(share):
+    def rise(scale):
+        moved = ENDS[0] + (ENDS[1] - ENDS[0]) * scale * jnp.asarray(share)
+        moved = jnp.concatenate([jnp.asarray(ENDS[:1]), moved])
+        return figures_of(moved, jnp.asarray(ENDS), DT, 0.0).rise_time
+
+    value, slope = jax.value_and_grad(rise)(1.0)
+    highest = np.max(share)
+    assert value == pytest.approx(1_000 * DT * (1.9 - highest))
+    assert value > 1_000 * DT
+    assert slope == pytest.approx(-1_000 * DT * highest)
+
+
 def test_a_diverging_step_has_finite_figures():
     found = figures(np.concatenate([np.ones(10), np.full(990, np.nan)]))
     assert all(np.isfinite(value) for value in found)
     assert found.overshoot > 1e5
+    low = figures(np.concatenate([np.full(10, 0.05), np.full(990, np.nan)]))
+    assert low.rise_time > 1_000 * DT
 
 
 def test_the_steps_span_nine_tenths_of_the_references():

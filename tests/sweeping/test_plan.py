@@ -1,6 +1,7 @@
 """Points of a sweep, and the messages about bad ones."""
 
 import copy
+import dataclasses
 
 import jax
 import numpy as np
@@ -10,9 +11,10 @@ from swept_studies import GRID, PARAMETERS
 from piezojax import control
 from piezojax.core.parameter import declarations
 from piezojax.core.space import Range
+from piezojax.identification.residual_record import ResidualRecord
 from piezojax.sweeping import read_swept
 from piezojax.sweeping.dataset import boxes
-from piezojax.sweeping.plan import Plan
+from piezojax.sweeping.plan import Plan, bytes_of_point, runs_of_point
 
 BOX = {path: dict(table) for path, table in PARAMETERS.items()}
 
@@ -101,6 +103,20 @@ def test_chunks_and_shards_contain_every_point_once(case_of):
     assert [p for start, stop in spans for p in range(start, stop)] == list(range(1000))
     shares = [chunk for i in (1, 2, 3) for chunk in plan.share((i, 3))]
     assert sorted(shares) == list(range(plan.chunks))
+
+
+@pytest.mark.parametrize("plant", [{"records": ["a.csv"]}, {"file": "model.json"}])
+def test_the_stretches_of_a_residual_are_runs_of_a_point(case_of, plant):
+    case = case_of(GRID)
+    alone = runs_of_point(case), bytes_of_point(case)
+    # Whatever the source of its plant, a case with a residual has twice as many runs.
+    known = dataclasses.replace(
+        case,
+        study=case.study.model_copy(update={"plant": plant}),
+        saved_residual=ResidualRecord(1e-3, {"train": (), "validate": ()}),
+    )
+    found = runs_of_point(known), bytes_of_point(known)
+    assert found == (2 * alone[0], 2 * alone[1])
 
 
 @pytest.mark.parametrize("shape", [(7,), (5, 3), (3, 4, 5), (1, 6, 1)])

@@ -204,7 +204,7 @@ def test_the_best_on_held_out_plants_is_stable_on_all_plants(compared, monkeypat
     first = comparison.rows[0].model_copy(update={"perturbed": worse})
     rows = [first, *comparison.rows[1:]]
     text = perturbed_text(comparison.model_copy(update={"rows": rows}))
-    assert "5 kHz: continuous, 2.00x below the next, PID" in text
+    assert "5 kHz: continuous; the next, PID, has 2.00 times its error" in text
 
 
 def test_the_studies_of_a_comparison_can_be_tuned_separately(compared):
@@ -289,8 +289,16 @@ def test_bad_controllers(changes, message):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"rates": [1e3, 1e3]}, "a rate of pid is listed twice"),
+        ({"rates": [1e3, 1e3]}, "rates: 1000 Hz is listed twice"),
+        (
+            {"controllers": {"pid": FILE["controllers"]["pid"] | {"rates": [2e3] * 2}}},
+            "controllers.pid.rates: 2000 Hz is listed twice",
+        ),
         ({"bounds": {"integral": {"lower": 1.0}}}, "lower and upper, or a factor"),
+        (
+            {"bounds": {"*": {"factor": 9.0, "scale": "linear"}}},
+            "scale is 'linear'; bounds of a factor are searched on the scale 'log'",
+        ),
         ({"controllers": {"pid": {"label": "PID"}}}, "controllers.pid.catalog is miss"),
         (
             {"controllers": {"pid": {**FILE["controllers"]["pid"], "catalogue": "x"}}},

@@ -5,8 +5,25 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from piezojax.report.robustness import front_figure, front_table
 from piezojax.tuning.front import non_dominated
 from piezojax.tuning.result import FrontPoint
+
+
+def point(error, loss):
+    return FrontPoint(
+        limit=2.0, value=1.9, loss=loss, kept=True, geomean_rms_um=error, gains={}
+    )
+
+
+def test_a_point_that_diverges_is_named_and_not_drawn():
+    table = front_table([point(0.5, -1.0), point(None, 1e6)], "sensitivity_peak")
+    _, _, errors, losses = (list(column.cells) for column in table.columns)
+    assert errors == ["500.00", "diverges"]
+    assert losses == ["-1.000", "failed"]
+    drawn = front_figure([point(0.5, -1.0), point(None, 1e6)], "sensitivity_peak", "")
+    assert [len(line.get_xdata()) for line in drawn.axes[0].lines] == [1]
+    assert front_figure([point(None, 1e6)], "sensitivity_peak", "") is None
 
 
 def place(limit, loss, kept=True, unit=0.0):

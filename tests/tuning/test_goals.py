@@ -7,12 +7,14 @@ import tomli_w
 
 import piezojax as pj
 from piezojax.analysis.stability import stability_reports
+from piezojax.analysis.step_response import NAMES
 from piezojax.catalog import p753, p753_stage
 from piezojax.report.step_pictures import steps_table
 from piezojax.report.tuning_pictures import write_results
 from piezojax.study import read
 from piezojax.tuning.alarms import peak_notes
 from piezojax.tuning.result import load_result
+from piezojax.tuning.step_tests import StepResult
 
 STUDY = {
     "title": "integral action that noise would like to be slow",
@@ -68,6 +70,19 @@ def test_goals_are_kept_and_active_with_steps_in_the_result(tmp_path):
     ]
     assert titles[2] == "to 2 %, ms"
     assert list(steps_table(outcome.steps).columns[2].cells)[3] == f"{1e3 * worst:.3g}"
+
+
+def test_a_diverged_step_is_told_from_one_that_never_settles():
+    names = list(StepResult.model_fields)[2:]
+    slow = dict.fromkeys(names[:4]) | dict.fromkeys(names[4:], 0.05)
+    lost, late = (
+        dict.fromkeys(NAMES, StepResult(before_um=0.0, after_um=1.0, **figures))
+        for figures in (dict.fromkeys(names), slow)
+    )
+    table = steps_table((lost, late))
+    rows = list(zip(*(column.cells for column in table.columns), strict=True))
+    assert rows[0] == ("1 um, before", *["diverges"] * 6)
+    assert rows[1] == ("1 um, tuned", *["never"] * 4, "5", "5")
 
 
 def test_incompatible_goals_have_an_alarm_each(tmp_path):

@@ -86,6 +86,14 @@ def test_alarms_of_the_fit_and_a_missing_bound_are_alarms(stability):
     assert "gives no bound on the error" in second
 
 
+def test_a_missing_bound_of_several_axes_has_a_remedy_that_can_be_followed(stability):
+    about = About(input_ranges=[(0.0, 1.0)] * 2, residual_rms=[0.1, 0.1, 0.2])
+    (alarm,) = model_alarms(about, True, 2.0, stability)
+    assert "has 2 inputs and 3 outputs, and no bound on the error" in alarm
+    assert "[ensemble]" in alarm
+    assert "longer record" not in alarm
+
+
 def test_an_unchecked_model_has_a_note():
     (note,) = unchecked(About(record="bench.csv"))
     assert "fitted to bench.csv and never checked" in note

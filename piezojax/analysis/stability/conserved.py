@@ -37,8 +37,7 @@ class LinearLoop(NamedTuple):
     def integrates(self) -> bool:
         """Return whether L has a pole at z = 1, to within ``TOLERANCE``."""
         rows = self.A - np.eye(len(self.A))
-        length = np.linalg.norm(rows, axis=1, keepdims=True)
-        singular = np.linalg.svd(rows / length, compute_uv=False)
+        singular = np.linalg.svd(rows / _lengths(rows)[:, None], compute_uv=False)
         return bool(np.any(singular < TOLERANCE))
 
     def response(self, angle: np.ndarray) -> np.ndarray:
@@ -141,8 +140,7 @@ def without_conserved(loop: Matrices) -> Matrices:
     """
     A, B, C, dt, *_ = loop
     rows = np.hstack([A - np.eye(len(A)), B.reshape(len(A), -1)])
-    length = np.linalg.norm(rows, axis=1)
-    length[length == 0.0] = 1.0
+    length = _lengths(rows)
     left, singular, _ = np.linalg.svd(rows / length[:, None], full_matrices=True)
     count = len(A) - int(np.sum(singular > TOLERANCE))
     if count == 0:
@@ -159,6 +157,12 @@ def without_conserved(loop: Matrices) -> Matrices:
         dt,
         count,
     )
+
+
+def _lengths(rows: np.ndarray) -> np.ndarray:
+    """Return the lengths of ``rows``, 1 for a row of zeros."""
+    length = np.linalg.norm(rows, axis=1)
+    return np.where(length > 0.0, length, 1.0)
 
 
 def balanced(loop: Matrices) -> Matrices:
