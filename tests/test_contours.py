@@ -153,6 +153,7 @@ def test_gradients_of_a_circle_equal_the_closed_form():
         ("Rx+Ry:LISSAJOUS2/1.5", {"Rx": "COS2", "Ry": "SIN1.5"}),
         ("Rx+Ry:LISSAJOUS6/2", {"Rx": "SIN6", "Ry": "COS2"}),
         ("Rx+Ry:RASTER10", {"Rx": "SCAN10", "Ry": "TRI0.5"}),
+        ("Rx+Ry:RASTER0.001", {"Rx": "SCAN0.001", "Ry": "TRI0.00005"}),
         ("Rx+Ry:RASTER10/0.25 Z:SIN1", {"Rx": "SCAN10", "Ry": "TRI0.25", "Z": "SIN1"}),
     ],
 )

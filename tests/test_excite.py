@@ -132,6 +132,13 @@ def test_a_buffer_holds_each_part(points):
     assert seconds == pytest.approx(expected, rel=0.03)
 
 
+def test_parts_that_fit_a_buffer_exactly_keep_their_rate():
+    longest = max(drawn(part).voltages.size for part in (ladder, holds))
+    parts = buffered(GENERATOR, longest)
+    assert [part.rate for part in parts] == [GENERATOR.rate] * 3
+    assert max(part.voltages.size for part in parts) == longest
+
+
 def test_a_buffer_may_be_too_short():
     with pytest.raises(ValueError, match="100 points are too few for the ladder: a"):
         buffered(GENERATOR, 100)

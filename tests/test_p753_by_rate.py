@@ -110,6 +110,8 @@ def test_plants_at_a_slower_rate_hold_their_input(name):
     np.testing.assert_allclose(run(coarse, voltage), held, rtol=0.0, atol=1e-12)
     with pytest.raises(ValueError, match="rate in Hz is 3000; it must divide 20000"):
         at_rate(PLANTS, name, 3_000.0)
+    with pytest.raises(ValueError, match="rate in Hz is 0; it must divide 20000"):
+        at_rate(PLANTS, name, 0)
 
 
 SERIES = tuple(mantissa * 10.0**power for power in range(4) for mantissa in (1, 2, 5))

@@ -1,8 +1,12 @@
 """The P-753 actuator (Physik Instrumente, 15 um) and its printed controllers.
 
 Every number carries its equation or table in Y. Cao's thesis (2013). Dynamics and gains
-hold at 20 kHz unless another rate is stated.
+hold at 20 kHz unless another rate is stated. Raises ValueError for a ``table`` that is
+not printed.
 """
+
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -155,6 +159,25 @@ EFFORT_WEIGHT = 0.1
 """Weights of the H-infinity design, the crossover in rad/s: ours."""
 
 
+def printed(name: str, values: Mapping[Any, Any], key: Any) -> Any:
+    """Return ``values[key]``; raise ValueError with the keys for one not printed."""
+    if key not in values:
+        raise ValueError(
+            f"{name} is {key}; it must be one of {', '.join(map(str, values))}"
+        )
+    return values[key]
+
+
+def samples_at(rate: int) -> int:
+    """Return the number of samples at 20 kHz in one at ``rate`` (Hz).
+
+    Raises ValueError for a rate that does not divide 20 kHz.
+    """
+    if rate <= 0 or RATE % rate:
+        raise ValueError(f"rate in Hz is {rate:g}; it must divide {RATE:g}")
+    return int(RATE // rate)
+
+
 def hysteresis(scheme: str = "trapezoid") -> ColemanHodgdon:
     """Return the chapter 5 hysteresis, V to um."""
     return ColemanHodgdon(**HYSTERESIS_CHAPTER_5, scheme=scheme)
@@ -176,6 +199,10 @@ def kalman(model: ARMA) -> KalmanFilter:
     return model_kalman(model, NOISE_RMS, PROCESS_RMS, DRIFT_RMS, DT)
 
 
+def _gains(table: str, controller: str) -> dict[str, float]:
+    return printed("table", GAINS, table)[controller]
+
+
 def _sliding_mode(
     model: ARMA, gains: dict[str, float], observer: Observer | None = None
 ) -> SlidingMode:
@@ -191,14 +218,14 @@ def _sliding_mode(
 
 def sliding_mode(table: str = "5-2") -> SlidingMode:
     """Return the nominal PID-based SMC with the printed gains, um to V."""
-    return _sliding_mode(ARMA(**DYNAMICS_FROM_VOLTAGE), GAINS[table]["pid"])
+    return _sliding_mode(ARMA(**DYNAMICS_FROM_VOLTAGE), _gains(table, "pid"))
 
 
 def inversion(table: str = "5-2") -> InversionControl:
     """Return the inversion-based PID-SMC with the printed gains, um to V."""
     model = ARMA(**DYNAMICS_BEHIND_HYSTERESIS)
     return InversionControl(
-        _sliding_mode(model, GAINS[table]["inversion"]),
+        _sliding_mode(model, _gains(table, "inversion")),
         InverseColemanHodgdon(hysteresis()),
     )
 
@@ -209,7 +236,7 @@ def disturbance_observer(
     """Return the DOB-based PID-SMC with the printed gains, um to V."""
     model = ARMA(**DYNAMICS_BEHIND_HYSTERESIS)
     return DisturbanceObserverControl(
-        _sliding_mode(model, GAINS[table]["dob"]),
+        _sliding_mode(model, _gains(table, "dob")),
         model,
         gain=GAIN,
         cutoff=CUTOFF,
@@ -276,7 +303,7 @@ def pid() -> PID:
 def kalman_sliding_mode(table: str = "5-2") -> SlidingMode:
     """Return ``sliding_mode`` with a Kalman filter (ours) as observer."""
     model = ARMA(**DYNAMICS_FROM_VOLTAGE)
-    return _sliding_mode(model, GAINS[table]["pid"], kalman(model))
+    return _sliding_mode(model, _gains(table, "pid"), kalman(model))
 
 
 def kalman_disturbance_observer(table: str = "5-2") -> DisturbanceObserverControl:
@@ -287,7 +314,7 @@ def kalman_disturbance_observer(table: str = "5-2") -> DisturbanceObserverContro
     """
     model = ARMA(**DYNAMICS_BEHIND_HYSTERESIS)
     return DisturbanceObserverControl(
-        _sliding_mode(model, GAINS[table]["dob"], kalman(model)),
+        _sliding_mode(model, _gains(table, "dob"), kalman(model)),
         model,
         gain=GAIN,
         cutoff=CUTOFF,

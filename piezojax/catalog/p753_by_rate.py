@@ -73,13 +73,11 @@ def chapter4_plant(*, rate: int = 20_000) -> System:
 
 
 def _resampled(stage: Series, rate: int) -> Series:
-    samples, rest = divmod(int(p753.RATE), rate)
-    if rest:
-        raise ValueError(f"rate in Hz is {rate:g}; it must divide {p753.RATE:g}")
     hysteresis, dynamics = stage.parts
     assert isinstance(dynamics, ARMA)
     # At a constant voltage the hysteresis is static; only the dynamics move.
-    return series(hysteresis=hysteresis, dynamics=slower(dynamics, samples))
+    held = slower(dynamics, p753.samples_at(rate))
+    return series(hysteresis=hysteresis, dynamics=held)
 
 
 def slower(model: ARMA, samples: int) -> ARMA:

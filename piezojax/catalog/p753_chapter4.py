@@ -148,7 +148,7 @@ def unfiltered(rate: int = 20_000) -> AlphaBeta:
 
 def model(rate: int = 20_000) -> ARMA:
     """Return the row of Table 4-1 for ``rate``, V to um."""
-    return ARMA(**_printed("rate in Hz", p753.DYNAMICS_BY_RATE, rate))
+    return ARMA(**p753.printed("rate in Hz", p753.DYNAMICS_BY_RATE, rate))
 
 
 def model_reference(
@@ -159,9 +159,9 @@ def model_reference(
     ``filter`` replaces the printed one. Raises ValueError for a rate or a table that is
     not printed.
     """
-    gains = _printed("table", MODEL_REFERENCE_GAINS, table)
+    gains = p753.printed("table", MODEL_REFERENCE_GAINS, table)
     return ModelReferenceSlidingMode(
-        **with_law(_printed("rate in Hz", gains, rate), rate),
+        **with_law(p753.printed("rate in Hz", gains, rate), rate),
         surface=SURFACE,
         error_weight=ERROR_WEIGHT,
         model=model(rate),
@@ -178,7 +178,7 @@ def anticipating_model_reference(rate: int = 20_000) -> Anticipation:
 def traditional(rate: int = 20_000) -> SlidingMode:
     """Return the traditional PID-SMC of Table 4-2 (1 or 20 kHz), um to V."""
     return SlidingMode(
-        **with_law(_printed("rate in Hz", TRADITIONAL_GAINS, rate), rate),
+        **with_law(p753.printed("rate in Hz", TRADITIONAL_GAINS, rate), rate),
         model=model(rate),
         filter=alpha_beta(rate),
     )
@@ -187,7 +187,7 @@ def traditional(rate: int = 20_000) -> SlidingMode:
 def bang_bang(rate: int = 20_000) -> SlidingMode:
     """Return the nominal DSMC with bang-bang switching (1 or 20 kHz), um to V."""
     return SlidingMode(
-        BangBang(_printed("rate in Hz", BANG_BANG_GAINS, rate)),
+        BangBang(p753.printed("rate in Hz", BANG_BANG_GAINS, rate)),
         surface=TRADITIONAL_GAINS[rate]["surface"],
         error_weight=ERROR_WEIGHT,
         control_weight=BANG_BANG_CONTROL_WEIGHT,
@@ -199,7 +199,7 @@ def bang_bang(rate: int = 20_000) -> SlidingMode:
 def continuous(rate: int = 20_000) -> ContinuousSlidingMode:
     """Return the continuous PID-SMC (5, 10 or 20 kHz), um to V."""
     return ContinuousSlidingMode(
-        **with_law(_printed("rate in Hz", CONTINUOUS_GAINS, rate), rate),
+        **with_law(p753.printed("rate in Hz", CONTINUOUS_GAINS, rate), rate),
         surface=p753.SURFACE,
         filter=alpha_beta(rate),
     )
@@ -229,18 +229,10 @@ def loop(
     ``stage`` (V to um) is ``plant`` if left out. Raises ValueError for a rate that does
     not divide 20 kHz.
     """
-    held, rest = divmod(int(p753.RATE), rate)
-    if rest:
-        raise ValueError(f"rate in Hz is {rate}; it must divide {p753.RATE:g}")
     stage = plant() if stage is None else stage
     return Feedback(
-        controller, Oversampled(stage, held), p753.actuator(), Sensor(noise_rms)
+        controller,
+        Oversampled(stage, p753.samples_at(rate)),
+        p753.actuator(),
+        Sensor(noise_rms),
     )
-
-
-def _printed(name: str, values: Mapping[Any, Any], key: Any) -> Any:
-    if key not in values:
-        raise ValueError(
-            f"{name} is {key}; it must be one of {', '.join(map(str, values))}"
-        )
-    return values[key]

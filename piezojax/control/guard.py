@@ -56,8 +56,9 @@ class Guard(System):
     - the voltage travels more than ``unseen`` while the reading does not change at all.
 
     From then on the command moves to ``retreat`` at no more than ``slew``, until the
-    guard is started again. For one axis. The input is an Observation, the output the
-    command.
+    guard is started again. The controller receives the last finite reading in place of
+    one that is not; at the start, the reference. For one axis. The input is an
+    Observation, the output the command.
 
     Raises ValueError unless ``lower`` is below ``upper`` and ``retreat`` between them.
     """
@@ -89,11 +90,14 @@ class Guard(System):
 
     def init(self, input: Observation) -> GuardState:
         none = jnp.zeros((), jnp.int32)
+        measured = as_array(input.measured)
+        # The controller never sees a reading that is not a number.
+        reading = jnp.where(jnp.isfinite(measured), measured, input.reference)
         return GuardState(
-            self.controller.init(input),
+            self.controller.init(input._replace(measured=reading)),
             none,
             as_array(input.applied),
-            as_array(input.measured),
+            reading,
             none,
             none,
             none,
@@ -103,7 +107,6 @@ class Guard(System):
     def step(self, state: GuardState, input: Observation) -> tuple[GuardState, Scalar]:
         measured = as_array(input.measured)
         seen = jnp.isfinite(measured)
-        # The controller never sees a reading that is not a number.
         reading = jnp.where(seen, measured, state.measured)
         controller, wanted = self.controller.step(
             state.controller, input._replace(measured=reading)

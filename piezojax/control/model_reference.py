@@ -92,17 +92,27 @@ class ModelReferenceSlidingMode(System):
         newest, *older = errors
         return newest + dot(reversed(self.surface), older)
 
+    def _equivalent(
+        self, errors: tuple[Scalar, ...], past: tuple[Scalar, ...]
+    ) -> Scalar:
+        # S A_e delta: each error one sample older, the newest predicted by the model.
+        shifted = dot(reversed(self.surface), errors)
+        return self._inverse(-(self._advanced(errors) + shifted), past)
+
     def init(self, input: Observation) -> ModelReferenceState:
         reference = as_array(input.reference)
         order, lags = len(self.model.autoregressive), len(self.model.moving) - 1
         desired = (reference,) * order
         # At rest u1 equals its past: the fixed point of an affine map, from two values.
         wanted = reference - self._advanced(desired)
-        start = self._inverse(wanted, (jnp.zeros_like(reference),) * lags)
+        none = (jnp.zeros_like(reference),) * lags
+        start = self._inverse(wanted, none)
         slope = self._inverse(jnp.zeros_like(reference), (as_array(1.0),) * lags)
         forward = start / (1.0 - slope)
         feedback = input.applied - forward
         errors = (input.measured - reference,) * order
+        # The law gives the part of the feedback that u_eq does not.
+        equivalent = slope * feedback + self._equivalent(errors, none)
         return ModelReferenceState(
             filter=self.filter.init(input),
             reference_model=self.reference_model.init(reference),
@@ -110,8 +120,7 @@ class ModelReferenceSlidingMode(System):
             errors=errors[1:],
             forward=(forward,) * max(lags, 1),
             feedback=(feedback,) * max(lags, 1),
-            # The remainder of the feedback is u_eq.
-            law=self.law.start(self._sliding(errors), feedback - slope * feedback),
+            law=self.law.start(self._sliding(errors), feedback - equivalent),
         )
 
     def step(
@@ -127,9 +136,7 @@ class ModelReferenceSlidingMode(System):
         forward = self._inverse(wanted, state.forward)
 
         sliding = self._sliding(errors)
-        # S A_e delta: each error one sample older, the newest predicted by the model.
-        shifted = dot(reversed(self.surface), errors)
-        equivalent = self._inverse(-(self._advanced(errors) + shifted), state.feedback)
+        equivalent = self._equivalent(errors, state.feedback)
         shortfall = input.applied - (state.forward[0] + state.feedback[0])
         driven = self.law.driven(state.law, shortfall)
         law, switching = self.law.step(driven, sliding)

@@ -38,9 +38,11 @@ def balanced_reduction(model: StateSpace, order: int) -> Reduction:
     Sources: B. C. Moore, IEEE Trans. Automatic Control 26, 1981, pp. 17-32 (balancing);
     U. M. Al-Saggaf and G. F. Franklin, IEEE Trans. Automatic Control 32, 1987, pp.
     815-819 (the bound for discrete time). Raises ValueError for a model that is not
-    stable, and for an ``order`` below 1 or above the number of states that are
-    controllable and observable.
+    stable or has no states, and for an ``order`` below 1 or above the number of states
+    that are controllable and observable.
     """
+    if not model.order:
+        raise ValueError("the model has no states; a reduction keeps at least 1")
     if not 1 <= order <= model.order:
         raise ValueError(f"order is {order}; it must be between 1 and {model.order}")
     balance = _balance(model)

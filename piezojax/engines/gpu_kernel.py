@@ -6,6 +6,7 @@ lane in registers.
 """
 
 import math
+from bisect import bisect_left
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -169,7 +170,7 @@ def _final(
 def _first_columns(step: ScalarStep) -> list[int]:
     """Return the column of the first element of each leaf of the inputs."""
     leaves = [place.leaf for place in step.places if place.part == "row"]
-    return [leaves.index(leaf) for leaf in range(max(leaves, default=-1) + 1)]
+    return [bisect_left(leaves, leaf) for leaf in range(max(leaves, default=-1) + 1)]
 
 
 def _filled(array: Array) -> Array:

@@ -53,10 +53,18 @@ XLA_FFI_Error *call(XLA_FFI_CallFrame *frame)
     }
     void **in = frame->args.args, **out = frame->rets.rets;
     const int64_t *sizes = buffer(in, 3)->dims;
-    run_blocks(sizes[0], sizes[1], sizes[2], buffer(in, 5)->dims[0],
-               data(in, 0), data(in, 1), data(in, 2), data(in, 3), data(in, 4)$rows,
-               data(out, 0), data(out, 1), data(out, 2), data(out, 3));
-    return NULL;
+    const char *failure = run_blocks(
+        sizes[0], sizes[1], sizes[2], buffer(in, 5)->dims[0],
+        data(in, 0), data(in, 1), data(in, 2), data(in, 3), data(in, 4)$rows,
+        data(out, 0), data(out, 1), data(out, 2), data(out, 3));
+    if (!failure)
+        return NULL;
+    XLA_FFI_Error_Create_Args error = {
+        .struct_size = XLA_FFI_Error_Create_Args_STRUCT_SIZE,
+        .message = failure,
+        .errc = XLA_FFI_Error_Code_RESOURCE_EXHAUSTED,
+    };
+    return frame->api->XLA_FFI_Error_Create(&error);
 }
 """)
 """Function that XLA calls, written for the C interface of XLA.

@@ -83,10 +83,12 @@ $end
 """)
 
 SIGNATURE = """
-void run_blocks(int64_t outer, int64_t blocks, int64_t directions, int64_t samples,
-                const double *shared, const double *all_own, const double *start,
-                const double *all_slopes, const double *slope_start$rows,
-                double *end, double *log, double *slope_end, double *slope_log)
+/* Returns the reason of a failure, or NULL. */
+const char *run_blocks(
+    int64_t outer, int64_t blocks, int64_t directions, int64_t samples,
+    const double *shared, const double *all_own, const double *start,
+    const double *all_slopes, const double *slope_start$rows,
+    double *end, double *log, double *slope_end, double *slope_log)
 """
 
 RUN = Template(
@@ -115,6 +117,7 @@ RUN = Template(
         $end
     }
     $finish
+    return NULL;
 }
 """
 )
@@ -124,6 +127,8 @@ REVERSE = Template(
     + """{
     const int64_t lanes = blocks * STRIDE, segments = (samples + SEGMENT - 1) / SEGMENT;
     struct kept *kept = aligned_alloc(64, SEGMENT * GROUPS * sizeof *kept);
+    if (!kept && sizeof *kept)
+        return "no memory for the values of a segment";
     struct fixed fixed;
     start_fixed(&fixed, shared);
     for (int64_t block = 0; block < outer * blocks; block++) {
@@ -146,6 +151,7 @@ REVERSE = Template(
         $end
     }
     free(kept);
+    return NULL;
 }
 """
 )
@@ -187,7 +193,9 @@ VALUES = {
 groups."""
 
 SLOPES = {
-    "begin": "struct slopes *turned = aligned_alloc(64, directions * sizeof *turned);",
+    "begin": """struct slopes *turned = aligned_alloc(64, directions * sizeof *turned);
+    if (!turned && directions)
+        return "no memory for the derivatives";""",
     "start": """for (int64_t n = 0; n < directions; n++)
             start_slopes(&turned[n],
                          slope_start + (block * directions + n) * $sloping * STRIDE,

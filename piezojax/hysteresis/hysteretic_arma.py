@@ -82,8 +82,8 @@ class HystereticARMA(Hysteresis):
         both keep their DC gains, which become a and b, and share the shape that fits
         both best (the first singular vector of the two, each scaled to length one).
         Raises ValueError if the sine of the angle between them is above ``tolerance``
-        (1 accepts every model), if both are zero, or if the shared shape has a DC gain
-        of zero.
+        (1 accepts every model), if both are zero, if the shared shape has a DC gain of
+        zero, or if the model has a pole at z = 1.
         """
         numerators = np.array([self.moving_1, self.moving_2], dtype=float)
         lengths = np.linalg.norm(numerators, axis=1, keepdims=True)
@@ -103,6 +103,11 @@ class HystereticARMA(Hysteresis):
         if abs(shape.sum()) < 1e-12:
             raise ValueError("the shared numerator sums to 0; there is no DC gain")
         rest = 1.0 - sum(float(a) for a in self.autoregressive)
+        if abs(rest) < 1e-12:
+            raise ValueError(
+                "the autoregressive coefficients sum to 1, a pole at z = 1; there is "
+                "no DC gain"
+            )
         gain_1, gain_2 = numerators.sum(axis=1) / rest
         return series(
             hysteresis=ColemanHodgdon(

@@ -9,6 +9,7 @@ functions below.
 
 import math
 import re
+from decimal import Decimal
 from fractions import Fraction
 
 import jax.numpy as jnp
@@ -128,7 +129,8 @@ def signals_of(name: str) -> tuple[str, str]:
             waves = _quadrature(ratio.numerator)
             return f"{waves[0]}{first}", f"{waves[1]}{second}"
         if kind == "RASTER":
-            slow = second or str(Fraction(first) / LINES * 1.0)
+            # Without an exponent, which the name of a signal cannot hold.
+            slow = second or f"{Decimal(str(Fraction(first) / LINES * 1.0)):f}"
             return f"SCAN{first}", f"TRI{slow}"
     raise ValueError(
         f"contour {shown(name)} is unknown; it must have the form of one of "

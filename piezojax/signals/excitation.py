@@ -27,9 +27,6 @@ EDGE = 0.02
 COARSEST = 50
 """Smallest number of samples in a cycle over the whole range."""
 
-ROUNDED = 16
-"""Samples by which rounding may lengthen a part at a lower rate."""
-
 LADDER = ((1.0, 1.0, 2, 1.0), (2.5, 0.6, 6, 0.15), (7.0, 0.2, 4, 1.0))
 """Groups of cycles: over the whole range, nested loops that shrink, and small loops.
 Of each: frequency (times ``slowest``), height (share of the range), number of cycles,
@@ -220,18 +217,21 @@ def buffered(generator: Generator, points: int, seed: int = 0) -> list[Part]:
     """
     found = []
     for part in PARTS:
-        whole = part(generator, np.random.default_rng([seed, 0]))
+        least = generator.slowest
         if part is multisine:
-            least = max(generator.slowest, 2.0 * generator.rate / points)
-            own = replace(generator, slowest=least)
-        else:
-            # The moves and the rounding of each part take a few samples more.
-            every = ceil(whole.voltages.size / max(points - 2 * ROUNDED, 1))
+            least = max(least, 2.0 * generator.rate / points)
+        own = replace(generator, slowest=least)
+        made = part(own, np.random.default_rng([seed, 0]))
+        every = ceil(made.voltages.size / max(points, 1))
+        # The moves and the rounding of each part may take a few samples more.
+        while made.voltages.size > points:
             if generator.rate / every < COARSEST * generator.slowest:
                 raise ValueError(
-                    f"{points} points are too few for the {whole.name}: a cycle would "
+                    f"{points} points are too few for the {made.name}: a cycle would "
                     f"have fewer than {COARSEST} samples"
                 )
             own = replace(generator, rate=generator.rate / every, highest=None)
-        found.append(part(own, np.random.default_rng([seed, 0])))
+            made = part(own, np.random.default_rng([seed, 0]))
+            every += 1
+        found.append(made)
     return found

@@ -321,6 +321,17 @@ def test_the_printed_inverse_diverges_and_the_tikhonov_inverse_decays(rate):
     assert moduli["tikhonov"] < 0.5
 
 
+@pytest.mark.parametrize(
+    "controller", [catalog.model_reference(), controller_of(TIKHONOV)]
+)
+def test_a_start_off_the_reference_moves_by_one_step_of_the_integral(controller):
+    seen = Observation(*map(jnp.asarray, (1.0, 1.0, 0.5, 0.8)))
+    _, command = controller.step(controller.init(seen), seen)
+    sliding = -0.5 * (1.0 + sum(controller.surface))
+    moved = -controller.law.integral * controller.law.dt * sliding
+    assert command == pytest.approx(0.8 + float(moved), rel=1e-12)
+
+
 PRINTED = catalog.model_reference()
 SWITCHED = catalog.bang_bang()
 LONGER = ARMA((0.5, 0.1, 0.1), (1.0,))
@@ -379,11 +390,18 @@ def changed(controller, **values):
             "rate in Hz is 3000; it must be one of 1000, 2000, 5000, 10000, 20000",
         ),
         (lambda: catalog.model_reference(table="4-2"), "table is 4-2; .* 4-3, 4-4"),
+        (lambda: p753.sliding_mode("9-9"), "table is 9-9; .* one of 5-2, 5-4"),
+        (lambda: p753.inversion("9-9"), "table is 9-9; .* one of 5-2, 5-4"),
+        (lambda: p753.disturbance_observer("9-9"), "table is 9-9; .* 5-2, 5-4"),
         (lambda: catalog.traditional(5_000), "rate in Hz is 5000; .* 1000, 20000"),
         (lambda: catalog.continuous(1_000), "rate in Hz is 1000; .* 5000, 10000,"),
         (
             lambda: catalog.loop(PRINTED, 3_000),
             "rate in Hz is 3000; it must divide 20000",
+        ),
+        (
+            lambda: catalog.loop(PRINTED, 0),
+            "rate in Hz is 0; it must divide 20000",
         ),
     ],
 )

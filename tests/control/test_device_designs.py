@@ -6,7 +6,7 @@ import pytest
 
 import piezojax as pj
 from piezojax.analysis.stability import stability_reports
-from piezojax.catalog import p753_stage
+from piezojax.catalog import p753, p753_stage
 from piezojax.control.devices import DEVICE_DESIGNS, E727, NV200
 from piezojax.core.system import Affine, rest_output
 from piezojax.dynamics import FirstOrderLag, Mode
@@ -71,6 +71,17 @@ def test_the_notch_lies_at_the_strongest_mode():
     assert designed("e727", modes).notch_frequency_1 == pytest.approx(900.0, rel=1e-3)
     # Without a mode it lies at a quarter of the rate.
     assert designed("nv200", PLANTS["lag"]()).notchf == pytest.approx(5000.0)
+
+
+def test_the_notch_of_an_e727_lies_at_9_khz_for_a_mode_above():
+    device = designed("e727", Affine(0.1) >> Mode(9100.0, 0.19, DT))
+    assert isinstance(device, E727)
+    assert device.notch_frequency_1 == 9000.0
+
+
+def test_the_slope_of_a_refused_plant_contains_its_dynamics():
+    with pytest.raises(ValueError, match=r"falls as the voltage rises, -0\.148\d* um"):
+        designed("e727", p753.hysteresis() >> Affine(-1.0) >> FirstOrderLag(1e-3, DT))
 
 
 def test_the_settings_are_those_of_the_device():

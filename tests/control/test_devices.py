@@ -239,6 +239,11 @@ def test_pyrpl_rounds_to_its_registers():
     assert slope(1500.0) == 1.0
 
 
+def test_pyrpl_has_no_cut_off_above_19_9_mhz():
+    typed = pyrpl(p=0.0, i=1.0, filter_1=30e6).typed()
+    assert float(typed.filter_1) == pytest.approx(125e6 / (2.0 * np.pi))
+
+
 def test_a_stabilizer_ignores_small_errors():
     """At 8 V the steps of single precision are 2^-9 codes: smaller errors vanish."""
     slow = stabilizer(p=-1e-6, i=1.0)

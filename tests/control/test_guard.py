@@ -150,6 +150,26 @@ def test_a_short_excess_is_no_fault():
     assert not np.any(run(guarded(), reference, wanted, measured, 50.0)[1])
 
 
+class Repeating(Told):
+    """A controller whose command is the reading, also that of its start."""
+
+    def init(self, input):
+        return input.measured
+
+    def step(self, state, seen):
+        return seen.measured, state + seen.measured
+
+
+@pytest.mark.parametrize("reading", [np.nan, np.inf])
+def test_the_controller_starts_at_the_reference_if_the_reading_is_no_number(reading):
+    guard = Guard(Repeating(), **LIMITS, dt=DT)
+    missed = Observation(*map(jnp.asarray, (2.0, 2.0, reading, 4.0)))
+    state = guard.init(missed)
+    assert (state.controller, state.measured) == (2.0, 2.0)
+    state, _ = guard.step(state, missed)
+    assert (state.controller, state.measured, state.reason) == (2.0, 2.0, 1)
+
+
 @given(
     wanted=st.lists(
         st.floats(allow_nan=True, allow_infinity=True, width=32),

@@ -14,6 +14,7 @@ from piezojax.dynamics import (
     StateSpace,
     balanced_reduction,
     fast_part,
+    matrix_arma,
     observability_form,
 )
 
@@ -141,11 +142,16 @@ def test_a_controller_on_a_reduced_model_stabilises_the_stage(order):
 def test_bad_reductions_are_refused():
     with pytest.raises(ValueError, match="order is 16; it must be between 1 and 15"):
         balanced_reduction(WHOLE, 16)
+    gain = StateSpace(
+        np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), [[2.0]], 1.0
+    )
+    with pytest.raises(ValueError, match="the model has no states; a reduction keeps"):
+        balanced_reduction(gain, 1)
     unstable = StateSpace(1.1 * np.eye(3), np.eye(3), np.eye(3), np.zeros((3, 3)), 1e-3)
     with pytest.raises(ValueError, match=r"a pole at radius 1\.1; only a stable model"):
         balanced_reduction(unstable, 2)
     idle = StateSpace(block_diag(0.5, 0.4), [[1.0], [0.0]], [[1.0, 1.0]], [[0.0]], 1e-3)
-    with pytest.raises(ValueError, match="order is 2; only 1 states connect"):
+    with pytest.raises(ValueError, match="order is 2; only 1 states are controllable"):
         balanced_reduction(idle, 2)
     with pytest.raises(ValueError, match="lags is 4; 15 states and 3 outputs need 5"):
         observability_form(WHOLE, 4)
@@ -172,6 +178,15 @@ def single(poles, residues, through):
         [[through]],
         1e-3,
     )
+
+
+def test_only_a_mode_that_was_added_is_blamed():
+    nearly = single([1.0 - 1e-15, 0.9], [1.0, 1.0], 0.0)
+    assert len(observability_form(nearly).moving) == 2  # none was added
+    lag = single([0.5], [0.5], 0.0)
+    # (z - 0.5) (z - 1.2)
+    with pytest.raises(ValueError, match=r"to fill 2 lags has radius 1\.2; it must"):
+        matrix_arma._check_added(lag, [np.array([[1.7]]), np.array([[-0.6]])])
 
 
 def test_creep_and_memory_are_not_in_the_fast_part():

@@ -59,7 +59,9 @@ def test_a_record_with_steps_shows_slew_rate_and_mode():
     assert found.slew == pytest.approx(4e4, rel=0.05)
     assert found.modes[0].frequency == pytest.approx(600.0, rel=1e-3)
     assert found.modes[0].damping == pytest.approx(0.02, rel=0.05)
-    assert "a slew rate of" in str(found)
+    assert str(found).endswith(f"a slew rate of {found.slew:.3g} V/s")
+    commanded = Record(STEPS, stage(STEPS, 4e4), DT, input_units="um")
+    assert str(dynamics_of(commanded)).endswith(" um/s")
     assert dynamics_parts(record).endswith("+slew")
     # The part acts first, wherever the name of the chain has it.
     shape = structure(f"prandtl_ishlinskii+{dynamics_parts(record)}", record)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from jax.errors import JaxRuntimeError
 
 import piezojax as pj
 from piezojax.catalog import p753
@@ -24,6 +25,7 @@ from piezojax.engines import (
     gpu_kernel,
     lane_values,
     metered,
+    reverse_mode,
 )
 from piezojax.engines import native_library as library
 from piezojax.hardware import Quantiser, Saturation, Sensor
@@ -224,6 +226,25 @@ def test_a_system_without_state_or_numbers(engine):
         return jax.vmap(lane)(values)
 
     assert_engine_equals_loop(engine, simulated, jnp.array([0.5, 1.0]))
+
+
+class Second(System):
+    """A system that passes the second of two inputs."""
+
+    gain: jax.Array
+
+    def init(self, input=0.0):
+        return ()
+
+    def step(self, state, input):
+        return state, self.gain * input[1]
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_an_empty_leaf_before_the_inputs(engine):
+    inputs = jnp.zeros((SAMPLES, 0)), driven()
+    simulated = lanes_of(Second(as_array(1.0)), "gain", inputs, Means())
+    assert_engine_equals_loop(engine, simulated, spread(3))
 
 
 LOOPS = {
@@ -554,9 +575,31 @@ def test_a_failing_compiler_leaves_the_loop():
 
 
 @needs_compiler
+@pytest.mark.parametrize(
+    ("reversed_", "message"),
+    [(False, "no memory for the derivatives"), (True, "no memory for the values of")],
+)
+def test_a_run_without_memory_fails(reversed_, message, monkeypatch):
+    called = library._called
+
+    def starved(text, rows):
+        most = "aligned_alloc(64, INT64_MAX + 0 * "
+        return called(text.replace("aligned_alloc(64, ", most), rows)
+
+    monkeypatch.setattr(library, "_called", starved)
+
+    def total(value):
+        lag = Plain(value) >> FirstOrderLag(1e-3, 1e-4)
+        return jnp.sum(metered(lag, driven(), lag.init(), Means(), engine="native")[0])
+
+    with reverse_mode(reversed_), pytest.raises(JaxRuntimeError, match=message):
+        jax.jit((jax.grad if reversed_ else jax.jacfwd)(total))(1.7).block_until_ready()
+
+
+@needs_compiler
 def test_a_library_is_kept_and_a_damaged_one_compiled_again(tmp_path, monkeypatch):
     monkeypatch.setattr(library, "_path", lambda name: tmp_path / name)
-    text = "#include <stdint.h>\nvoid run_blocks(int64_t a, ...) { (void)a; }\n"
+    text = "#include <stdint.h>\nconst char *run_blocks(int64_t a, ...) { return 0; }\n"
     library._compiled("some", library._called(text, 1))
     kept = tmp_path / "some"
     assert library._kept("some") is not None

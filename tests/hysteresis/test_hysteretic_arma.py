@@ -99,6 +99,11 @@ def test_models_without_a_single_hysteresis_are_refused(numerators, message):
         made(moving_1=first, moving_2=second).cascade()
 
 
+def test_a_model_with_a_pole_at_1_is_refused():
+    with pytest.raises(ValueError, match="sum to 1, a pole at z = 1; there is no DC"):
+        made(autoregressive=(0.7, 0.2, 0.1)).cascade(tolerance=1.0)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -9,7 +9,7 @@ from ...core.parameter import declarations
 from ...core.system import Affine, System, rest_output
 from ...dynamics.plant_modes import plant_modes
 from ..design_model import CROSSOVER, DesignModel, design_model
-from .e727 import E727
+from .e727 import E727, HIGHEST
 from .nv200 import NV200, SLEW_OFF
 from .servo_loop import NO_SLEW
 
@@ -87,6 +87,7 @@ def e727(
 ) -> E727:
     """Return an E-727 whose integral and notch suit the plant between ``limits`` (V).
 
+    The notch lies at 9 kHz, the highest frequency of the device, if the mode is above.
     ``scale`` (V/um) is that of the device; ``slew`` um/s limits the setpoint, and
     ``dt`` is in s. Raises ValueError as ``nv200``.
     """
@@ -99,7 +100,7 @@ def e727(
             scale=scale,
             lower=limits[0],
             upper=limits[1],
-            notch_frequency_1=start.notch,
+            notch_frequency_1=min(start.notch, HIGHEST),
             notch_rejection_1=0.1,
             slew_rate=NO_SLEW if slew is None else slew,
             dt=dt,
@@ -110,10 +111,11 @@ def e727(
 
 def _rising(plant: System, dt: float, limits: Limits) -> DesignModel:
     model = design_model(plant, dt, limits)
-    if model.gain() * model.dynamics.dc_gain() <= 0.0:
+    slope = float(model.gain() * model.dynamics.dc_gain())
+    if slope <= 0.0:
         raise ValueError(
-            f"the output falls as the voltage rises, {float(model.gain()):.6g} um/V "
-            "between the limits; the gains of the device are positive"
+            f"the output falls as the voltage rises, {slope:.6g} um/V between the "
+            "limits; the gains of the device are positive"
         )
     return model
 

@@ -20,15 +20,18 @@ STRUCTURES = ("series", "parallel")
 NOTCH_METHODS = {0: "bilinear", 1: "hold"}
 """Discretisation of a notch by the value of parameter 0x08000600."""
 
+HIGHEST = 9e3
+"""Highest frequency of the notches and of the measurement's filter, Hz."""
+
 
 def _frequency(meaning: str):
     return parameter(
         "Hz",
         meaning,
         above=0.0,
-        most=9e3,
+        most=HIGHEST,
         scale="log",
-        typical=(10.0, 9e3),
+        typical=(10.0, HIGHEST),
         default=1e3,
     )
 

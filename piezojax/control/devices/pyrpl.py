@@ -127,5 +127,6 @@ class PyRPL(Device):
 def _available(cutoff: Scalar) -> Scalar:
     """Return the nearest cut-off of the module; its gradient is that of ``cutoff``."""
     highest = 1.0 / (2.0 * jnp.pi * CLOCK)
-    nearest = highest * 2.0 ** jnp.round(jnp.log2(cutoff / highest))
+    octaves = jnp.minimum(jnp.round(jnp.log2(cutoff / highest)), 0.0)
+    nearest = highest * 2.0**octaves
     return cutoff + jax.lax.stop_gradient(nearest - cutoff)
