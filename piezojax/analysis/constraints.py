@@ -63,7 +63,7 @@ Source = Literal["tracking", "extremes", "margins", "steps"]
 
 
 class Constraint(NamedTuple):
-    """Definition of a constraint: unit, direction and limited figure.
+    """Definition of a constraint: unit, direction and constrained figure.
 
     ``values(source, dt)`` returns the values of the figure, with the plants on the
     first axis, from the field ``source`` of the LoopFigures and dt in s. A limit must
@@ -307,10 +307,10 @@ objective. The margins, the bandwidth and the peak of y/r are those of the loop
 linearised at the highest reference, on both branches of the hysteresis. For a fitted
 plant the sensitivity peak and the delay margin are the worst within the error bound of
 its model. On several axes the sensitivity peak is the largest singular value of S, and
-the disk margin is a lower bound on the one of all axes at once. The gain, phase and
-delay margins are those of the worst axis with the others closed. The times and the
-steady-state error are those of the worst of four steps without noise
-(``step_response``)."""
+the disk margin is a lower bound for simultaneous changes of all axes. The gain, phase
+and delay margins are those of the worst axis with the others closed. The rise time, the
+settling time and the steady-state error are those of the worst of four steps without
+noise (``step_response``)."""
 
 
 def limits_of(written: Mapping[str, Any]) -> dict[str, float]:
@@ -337,9 +337,9 @@ def constraint_count(names: Iterable[str], plants: int, margin_plants: int) -> i
     """Return the number of ``violations`` of the limits ``names``.
 
     ``plants`` and ``margin_plants`` are numbers of plants. A limit on runs counts once
-    for each of ``plants``, a limit on steps once for each of them and each step. A
-    limit on margins counts once for each of ``margin_plants`` and each branch; the
-    limit on the sensitivity peak also counts once for each band.
+    for each of ``plants``, a limit on steps once for each of ``plants`` and each step.
+    A limit on margins counts once for each of ``margin_plants`` and each branch; the
+    limit on the sensitivity peak counts once for each of these and each band.
     """
     each = {
         "margins": margin_plants * len(BRANCHES),
@@ -393,7 +393,7 @@ def worst_excess(
 
 
 def worst_by_plant(limits: Iterable[str], loop: LoopFigures) -> dict[str, Array]:
-    """Return the worst value [plants] of each limited figure, by constraint.
+    """Return the worst value [plants] of each constrained figure.
 
     The worst value is the largest for an upper limit and the smallest for a lower one.
     """

@@ -17,7 +17,7 @@ class SlidingParts(NamedTuple):
     """RMS values of the sliding variable s = m e + de/dt and of its parts, um/s.
 
     ``sliding`` is s as the controller computes it from the measurement. ``error`` is
-    m e + de/dt of the true displacement. ``rest`` is their difference: the lag of the
+    m e + de/dt of the true displacement. ``rest`` is s minus that: the lag of the
     observer behind the motion, and sensor noise.
     """
 
@@ -27,7 +27,7 @@ class SlidingParts(NamedTuple):
 
     @property
     def share(self) -> Scalar:
-        """Share of ``error`` in the sum of both parts' mean squares, 0 to 1."""
+        """Mean square of ``error`` over that of ``error`` plus that of ``rest``."""
         return self.error**2 / (self.error**2 + self.rest**2)
 
 

@@ -40,8 +40,8 @@ class StepFigures(NamedTuple):
 
     If the displacement does not settle within the run, the settling time is longer than
     the run and falls as the displacement ends nearer to the reference. If it does not
-    reach 90 % of the height, the rise time is longer than the run and falls as the
-    largest displacement comes nearer to it.
+    reach 90 % of the height, the rise time is longer than the run and falls as the peak
+    of the step response comes nearer to 90 %.
     """
 
     rise_time: Array
@@ -105,7 +105,7 @@ def figures_of(
     last = max(1, round(LAST * error.size))
     band = jnp.maximum(noise / jnp.abs(height), 1e-12)
     return StepFigures(
-        # A run reaches nothing by diverging.
+        # Infinite and undefined samples of a diverging run do not count as a rise.
         dt * _rise(jnp.nan_to_num(found, nan=-1e6, posinf=-1e6, neginf=-1e6)),
         dt * _settled(error, BAND),
         dt * _settled(error, FINE),
@@ -118,7 +118,7 @@ def figures_of(
 def _rise(share: Float[Array, " samples"]) -> Array:
     """Return the time, in samples, from ``START`` to ``END``."""
     highest = jnp.max(share)
-    # A step that never reaches END has no time from START that could be extrapolated.
+    # Longer than the run, and increasing with the distance of the peak from END.
     never = share.size * (1.0 + END - highest)
     rise = _reached(share, END) - _reached(share, START)
     return jnp.where(highest >= END, rise, never)
@@ -127,7 +127,7 @@ def _rise(share: Float[Array, " samples"]) -> Array:
 def _reached(share: Float[Array, " samples"], level: float) -> Array:
     """Return the time, in samples, at which ``share`` first reaches ``level``.
 
-    The result has no meaning if it never does.
+    The result is valid only if ``share`` reaches ``level``.
     """
     at = jnp.argmax(share >= level)
     here, before = share[at], jnp.where(at > 0, share[at - 1], 0.0)

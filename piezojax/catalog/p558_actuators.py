@@ -1,7 +1,7 @@
 """Four actuators under the plate of the P-558.TCD stage: an assumption of ours.
 
 The thesis commands Z, Rx and Ry and gives no number, position or travel of the
-actuators. Assumed are four equal actuators in the corners of a square, which lift a
+actuators. This model has four equal actuators in the corners of a square, which lift a
 rigid plate through equal stiffnesses. The plate then takes the least-squares pose of
 their elongations.
 """

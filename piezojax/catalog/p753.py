@@ -1,8 +1,8 @@
 """The P-753 actuator (Physik Instrumente, 15 um) and its printed controllers.
 
 Every number carries its equation or table in Y. Cao's thesis (2013). Dynamics and gains
-hold at 20 kHz unless another rate is stated. Raises ValueError for a ``table`` that is
-not printed.
+hold at 20 kHz unless another rate is stated. Functions with an argument ``table`` raise
+ValueError for a table that is not printed.
 """
 
 from collections.abc import Mapping
@@ -160,7 +160,7 @@ EFFORT_WEIGHT = 0.1
 
 
 def printed(name: str, values: Mapping[Any, Any], key: Any) -> Any:
-    """Return ``values[key]``; raise ValueError with the keys for one not printed."""
+    """Return ``values[key]``; raise ValueError, listing the keys, if it is missing."""
     if key not in values:
         raise ValueError(
             f"{name} is {key}; it must be one of {', '.join(map(str, values))}"
@@ -169,7 +169,7 @@ def printed(name: str, values: Mapping[Any, Any], key: Any) -> Any:
 
 
 def samples_at(rate: int) -> int:
-    """Return the number of samples at 20 kHz in one at ``rate`` (Hz).
+    """Return the number of 20 kHz samples in one sample at ``rate`` (Hz).
 
     Raises ValueError for a rate that does not divide 20 kHz.
     """

@@ -1,14 +1,15 @@
 """The P-753 and one controller of each kind at any sampling rate of Table 4-1.
 
 The gains are the printed ones where Y. Cao's thesis (2013) prints some. At other rates
-they are ours: the printed gains of the nearest rate, scaled to the same loop in
-samples. With q the new sample time over the printed one, a gain on an error rate (um/s)
-is multiplied by q, one on its derivative by q^2 and the slope m of a surface (1/s) by
-1/q. Integral gains, weights, the alpha-beta filter and cut-offs in rad/s are unchanged.
-The model is the row of Table 4-1 for the rate. Rates in Hz.
+they are ours: the printed gains of the nearest rate, scaled so that the response,
+counted in samples, stays about the same. With q the new sample time over the printed
+one, a gain on an error rate (um/s) is multiplied by q, one on its derivative by q^2 and
+the slope m of a surface (1/s) by 1/q. Integral gains, weights, the alpha-beta filter
+and cut-offs in rad/s are unchanged. The model is the row of Table 4-1 for the rate; for
+``inversion`` and ``disturbance_observer`` at 20 kHz it is (5.33). Rates in Hz.
 
-Raises ValueError for a controller at a rate without a model, with a list of the known
-rates, and for a plant at a rate that does not divide 20 kHz.
+A controller raises ValueError, listing the known rates, for a rate without a model; a
+plant raises it for a rate that does not divide 20 kHz.
 """
 
 import math

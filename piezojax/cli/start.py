@@ -62,7 +62,7 @@ QUESTIONS = {
 """The questions by the name of their option; ``planned`` gives the defaults."""
 
 OF_DEVICES = ("scale", "lowest", "highest")
-"""Questions that only a controller of a vendor needs."""
+"""Questions that only concern the controller of a vendor's device."""
 
 
 def questions(function: Callable) -> Callable:

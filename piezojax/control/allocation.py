@@ -85,10 +85,10 @@ class Allocation(System):
 
     There is no iteration. On each of the 3^n faces of the box of bounds the
     least-squares solution is linear in pose and bounds, and the best one within the
-    bounds is returned. Its matrices are computed from ``geometry`` and the weights at
-    trace time, so only pose and bounds can be differentiated. To study an error of the
-    geometry, change that of the stage. The commands of ``"bounded"`` are continuous in
-    pose and bounds, with kinks where the face changes.
+    bounds is returned. The matrices of these solutions are computed from ``geometry``
+    and the weights at trace time, so only pose and bounds can be differentiated. To
+    study an error of the geometry, change that of the stage. The commands of
+    ``"bounded"`` are continuous in pose and bounds, with kinks where the face changes.
 
     The problem is stated by Johansen and Fossen, "Control allocation - a survey",
     Automatica 49 (2013). Raises ValueError for numbers that are not finite, weights

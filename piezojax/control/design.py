@@ -49,9 +49,10 @@ def disturbance_observer_sliding_mode(
     # The observer holds the whole gain from V to um; the model has unit gain.
     dynamics = scaled_to_dc(model.dynamics, 1.0)
     slope = model.gain()
-    if slope <= 0.0:
+    gain = slope * model.dynamics.dc_gain()
+    if gain <= 0.0:
         raise ValueError(
-            f"the output falls as the voltage rises, {slope:.6g} um/V between the "
+            f"the output falls as the voltage rises, {gain:.6g} um/V between the "
             "limits; the disturbance observer needs a gain above 0"
         )
 
@@ -59,7 +60,7 @@ def disturbance_observer_sliding_mode(
         return DisturbanceObserverControl(
             _sliding_mode(dynamics, dt, pace),
             dynamics,
-            slope * model.dynamics.dc_gain(),
+            gain,
             0.5 * CROSSOVER * pace / dt,
             dt,
         )

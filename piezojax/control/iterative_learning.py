@@ -106,10 +106,10 @@ def learn(
     Each trial starts from the same state at rest. ``system`` is a stage, V to um, whose
     input u is learned (y(k) is the output of the step with u(k)), or a Feedback loop,
     whose reference is corrected to r + u. ``noise`` [trials, samples] is added to the
-    measurement: in um for a stage, as unit-variance draws that the sensor scales for a
-    loop. ``feedforward`` of the first trial is zero by default, as in (2.14). The
-    function is pure, and differentiable in ``law`` and ``system``. The returned errors
-    are those of the true displacement.
+    measurement. For a stage it is in um; for a loop it holds draws of unit variance,
+    which the sensor scales. ``feedforward`` of the first trial is zero by default, as
+    in (2.14). The function is pure, and differentiable in ``law`` and ``system``. The
+    returned errors are those of the true displacement.
 
     Raises ValueError for fewer than one trial or signals of different lengths.
     """

@@ -162,7 +162,7 @@ def kinematic_kalman(
     """Return the Kalman filter for constant velocity, without a model of the stage.
 
     ``noise_rms`` of the sensor in um; ``acceleration_rms`` in um/s^2 of a random
-    acceleration, constant within a sample and independent of the others. It is an
+    acceleration, constant within a sample and independent between samples. It is an
     alpha-beta filter: the gains are alpha and alpha - beta, functions of
     ``acceleration_rms dt^2 / noise_rms`` alone (Kalata, 1984). Raises ValueError for
     values that are not above 0.

@@ -32,7 +32,7 @@ class ModelReferenceState(NamedTuple):
 
 
 class ModelReferenceSlidingMode(System):
-    """Sliding mode control that tracks a reference model, on a model of any order n.
+    """Sliding mode control along a reference model, for a model of any order n.
 
     The error is e = y - y_d, with y from ``filter`` and y_d the output of
     ``reference_model``. The sliding variable is ``s(k) = surface[0] e(k-n+1) + ... +

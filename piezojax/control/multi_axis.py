@@ -70,8 +70,8 @@ class MultiAxisSlidingMode(Designed):
     error.
 
     A diagonal matrix may be given by the q numbers of its diagonal, which takes fewer
-    products in each step. Raises ValueError for other matrices that are not [q, q], or
-    a surface that does not hold p matrices.
+    products in each step. Raises ValueError for a matrix or diagonal of another size,
+    or a surface that does not hold p matrices.
     """
 
     part_units: ClassVar[PartUnits] = {"law": {"s": "um", "v": "[u]"}}
@@ -112,8 +112,8 @@ class MultiAxisSlidingMode(Designed):
 
     def resolved(self) -> "ResolvedMultiAxis":
         """Return the controller with its gain matrices computed."""
-        # Packed: of scalars, XLA copies the terms into every result that contains them,
-        # and takes several times as long to compile.
+        # Packed into arrays: XLA would copy scalar terms into every result that has
+        # them, and take several times as long to compile.
         A, B = map(packed_matrices, (self.model.autoregressive, self.model.moving))
         S = packed_matrices(map(as_full, self.surface))
         PHI = packed_matrix(as_full(self.reaching))
@@ -140,7 +140,7 @@ class ResolvedMultiAxis(System):
     """MultiAxisSlidingMode with its gain matrices computed.
 
     ``forward`` F1, ``past_desired`` F1 A_i, ``rest`` (I + (p-1) K_s)^-1 and
-    ``equivalent`` (S B)^-1 (PHI S - S A), a block for each of X2.
+    ``equivalent`` (S B)^-1 (PHI S - S A), with one matrix for each block of X2.
     """
 
     law: SwitchingLaw

@@ -15,8 +15,8 @@ Row = tuple[Scalar, ...]
 class RecursiveWeightsState(Learned):
     """Weights and their covariance.
 
-    The covariance is the only matrix in a loop: as scalars it would take four times as
-    long to compile, because every element depends on every other, and run no faster.
+    The covariance is kept as an array: as scalars it would take four times as long to
+    compile, because every element depends on every other, and run no faster.
     """
 
     weights: Row

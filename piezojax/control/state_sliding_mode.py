@@ -62,7 +62,8 @@ class StateSlidingMode(Designed):
 
     Input an Observation of q axes, output a tuple of q commands. Raises ValueError for
     a model with a direct transmission or with different numbers of inputs and outputs,
-    and for ``reaching`` or a gain of the law that is not [q, q].
+    and for ``reaching`` or a gain of the law that is a matrix or diagonal of another
+    size than q.
     """
 
     part_units: ClassVar[PartUnits] = {"law": {"s": "um", "v": "[u]"}}

@@ -21,8 +21,9 @@ Rows: TypeAlias = tuple[tuple[Scalar, ...], ...]
 Matrix: TypeAlias = Rows | Axes
 """A matrix as its rows, or a diagonal matrix as the numbers on its diagonal."""
 Plain: TypeAlias = tuple[Any, ...]
-"""Axes, Rows or Matrix in a product, as plain tuples: checking the type of every scalar
-in every product would take most of the time of a traced test."""
+"""Type of the vectors and matrices in a product. It is plain, because the tests check
+annotated types at run time: checking every scalar of every product would take most of
+the time of tracing."""
 
 T = TypeVar("T")
 

@@ -116,12 +116,12 @@ def _value_from_data(value: Any, kind: Any, where: str) -> Any:
 
 
 def _levels(kind: Any) -> int:
-    """Return how many levels of lists a field of type ``kind`` holds."""
+    """Return the depth of nested lists in a field of type ``kind``."""
     return 1 + _levels(get_args(kind)[0]) if get_origin(kind) is tuple else 0
 
 
 def _nested(value: Any) -> int:
-    """Return how many levels of lists ``value`` has, by its first elements."""
+    """Return the depth of nested lists in ``value``, by its first elements."""
     if not isinstance(value, list | tuple):
         return 0
     return 1 + (_nested(value[0]) if value else 0)

@@ -66,7 +66,7 @@ def has_source(step: ScalarStep) -> bool:
 def source(step: ScalarStep, arrays: Arrays, rows: Sequence[Rows], shape: Shape) -> str:
     """Return the C source of ``run_blocks`` for a step.
 
-    The function returns NULL, or the reason of a failure: too little memory.
+    ``run_blocks`` returns NULL, or a message if memory cannot be allocated.
 
     All arrays are of doubles. Except for ``shared`` and the inputs, they have a last
     dimension STRIDE, for the lanes of a block:

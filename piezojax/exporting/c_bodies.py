@@ -55,8 +55,8 @@ def init_body(
 ) -> tuple[str, bool]:
     """Return the body of ``init``, and whether it computes with the parameters.
 
-    It sets the state at rest, that of the exported parameters if it solves equations.
-    The states ``rounding`` start at 0.
+    ``init`` sets the state at rest. If this state solves equations, it is computed here
+    for the exported parameters. The states ``rounding`` start at 0.
     """
     dynamic, static = eqx.partition(system, eqx.is_array)
 
@@ -68,7 +68,7 @@ def init_body(
         graph, outputs = trace(init, dynamic, interface.start)
         names = [*expressions(fields.parameters, "parameters->"), *names]
     except NotScalarError:
-        # ``init`` solves equations: they are solved here for the exported parameters.
+        # The state at rest solves equations: solve them for the exported parameters.
         general = False
         graph, outputs = trace(system.init, interface.start)
     for slot in rounding:

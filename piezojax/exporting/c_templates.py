@@ -51,8 +51,8 @@ typedef struct {{
 """
 
 FIXED_REST = """, for the exported parameters. The
-   state solves equations that this file does not hold: changed parameters do not move
-   it, so that the loop does not begin at rest with them"""
+   equations of this state are not in this file: a change of parameters does not change
+   the state, and the loop then does not begin at rest"""
 
 PREPARED_TYPE = """\
 /* Numbers that {name}_prepare computes from the parameters. */

@@ -85,10 +85,10 @@ def export(
 
     Raises ValueError for a ``folder`` in use, an unknown ``to``, a System with alarms
     (``about.unsafe``) or a controller without margins (``about.judged``) unless
-    ``accept_unsafe``, a controller without limits, and a System that cannot be written
-    in scalar operations, and fewer ``samples`` than 1, for a plant than twice ``HELD``.
-    An FMU, a linear model and biquads need a sampling rate; an
-    FMU also needs a C compiler.
+    ``accept_unsafe``, a controller without limits, a System that cannot be written in
+    scalar operations, and too few ``samples`` (a controller needs at least 1, a plant
+    twice ``HELD``). An FMU, a linear model and biquads need a sampling rate; an FMU
+    also needs a C compiler.
     """
     if to not in FORMS:
         raise ValueError(f"to is {to!r}: choose from {', '.join(FORMS)}")

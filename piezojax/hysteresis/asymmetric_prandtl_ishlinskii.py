@@ -27,8 +27,9 @@ class AsymmetricPrandtlIshlinskii(Hysteresis, Fittable):
     the one-sided square (x - origin)^2 / (2 scale) for x above ``origin`` and 0 below.
     The width in x of a play of q shrinks as x grows. The envelope functions of a
     generalised play skew a loop in the same way (Al Janaideh, Rakheja and Su 2009,
-    Mechatronics 19(5)); unlike their parameters, ``skew`` acts linearly on the output.
-    Units, memory, remaining parameters and errors are those of PrandtlIshlinskii.
+    Mechatronics 19(5)); the output is linear in ``skew``, but not in the parameters of
+    those functions. Units, memory, remaining parameters and errors are those of
+    PrandtlIshlinskii.
     """
 
     rest_field: ClassVar[str | None] = "rest_input"

@@ -21,8 +21,8 @@ EXACT = 1e-9
 """Largest deviation from a law that holds up to rounding."""
 
 STEP = 5e-3
-"""Largest deviation from a law that holds only to the order of the integration, at 16
-samples per branch."""
+"""Largest deviation from a law that holds only up to the error of the integration, at
+16 samples per branch."""
 
 LAWS: Laws = {
     "return-point memory": EXACT,

@@ -91,8 +91,9 @@ class RateDependentPrandtlIshlinskii(Hysteresis, Fittable):
     @classmethod
     def recipe(cls, extent: Extent) -> Recipe:
         fields, bounds = plays_recipe(extent)
-        # A sine over the whole range needs several periods in the record; a growth of a
-        # sixth of its period widens the plays by its amplitude where it is fastest.
+        # A sine over the whole range needs several periods in the record. If the growth
+        # is a sixth of the period, the fastest motion widens the plays by about the
+        # amplitude of the sine.
         most = 0.05 * extent.duration
         return Recipe(
             cls(**fields, growth=0.01 * most, dt=extent.dt),

@@ -49,7 +49,7 @@ def figure(width: float, height: float) -> Figure:
 
 
 def plain_number(value: float) -> str:
-    """Return ``value``, at least 0, in three digits or more, without an exponent."""
+    """Return ``value``, at least 0, in three digits or, from 999.5, as an integer."""
     return f"{value:.3g}" if value < 999.5 else f"{value:.0f}"
 
 

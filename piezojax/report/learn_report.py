@@ -77,7 +77,7 @@ def _outcome(report: LearnReport) -> str:
     left = {
         "done": "the gains from before",
         "stopped": "its safe gains",
-        "lost": "unknown gains: the connection was lost",
+        "lost": "unknown gains, for the reason in the alarm",
         "running": "the gains of the runs",
     }[report.verdict]
     if report.best is None:

@@ -131,7 +131,7 @@ def _sides(ax: Axes) -> list[tuple[Axis, tuple[float, float]]]:
 def _on_axes(artist: Line2D | Patch, ax: Axes) -> tuple[bool, bool]:
     """Return whether x and y of ``artist`` are in data coordinates of ``ax``.
 
-    Of a line or a band across the whole panel only one of the two is.
+    For a line or a band across the whole panel, only one of them is.
     """
     is_patch = isinstance(artist, Patch)
     transform = artist.get_data_transform() if is_patch else artist.get_transform()

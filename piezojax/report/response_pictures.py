@@ -165,7 +165,7 @@ def _draw_residual(ax: Axes, response: FrequencyResponse, fit: ModalFit) -> None
 
 
 def _part_of(response: FrequencyResponse) -> str:
-    """Return the causes of the errors that the variance of ``response`` holds."""
+    """Return the causes of the variance of ``response``, to label its curve."""
     both = response.noise is not None or response.resolution
     return "noise and distortion" if both else "noise"
 

@@ -121,7 +121,7 @@ def _ratio(report: RetuneReport) -> str:
 
 def _left(report: RetuneReport) -> str:
     if report.verdict == "lost":
-        return "unknown gains: the connection was lost"
+        return "unknown gains, for the reason in the alarm"
     if report.verdict == "done" and report.best is not None:
         return f"the gains of attempt {report.best + 1}"
     return "its safe gains"

@@ -55,7 +55,7 @@ def front_table(front: Sequence[FrontPoint], constraint: str) -> Table:
 
 
 def perturbed_figure(perturbed: Perturbed | None, title: str) -> Figure | None:
-    """Draw cumulative distributions of errors and limited figures, held-out plants."""
+    """Draw the distributions of errors and constrained figures on held-out plants."""
     if perturbed is None or not perturbed.geomeans_um:
         return None
     limited = list(perturbed.values)
@@ -95,7 +95,7 @@ def _distribution(panel: Any, values: Sequence[float], of: int, **style: Any) ->
 def front_figure(
     front: Sequence[FrontPoint] | None, constraint: str | None, title: str
 ) -> Figure | None:
-    """Draw the error against the limited figure at each point of a Pareto front."""
+    """Draw the error against the constrained figure along a Pareto front."""
     if not front or constraint is None:
         return None
     drawn = [

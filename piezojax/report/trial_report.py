@@ -107,7 +107,7 @@ _VERDICTS = {
     "kept": "kept on the stage",
     "restored": "those from before the trial",
     "stopped": "the safe ones of the stage",
-    "lost": "unknown: the connection was lost",
+    "lost": "unknown, for the reason in the alarm",
     "running": "being tried",
 }
 

@@ -108,7 +108,8 @@ def _axis_logs(study: Study, trace: Trace, both: Logs) -> Logs:
 def _drawn_traces(outcome: Outcome) -> list[Trace]:
     """Return the traces to draw, ``_MOST_TRACES`` at most.
 
-    Each has the largest error before tuning of its axis and kind of signal.
+    For each axis and kind of signal, only the trace with the largest error before
+    tuning is considered.
     """
     errors = outcome.result.before.per_reference_rms_um
     study = outcome.case.study

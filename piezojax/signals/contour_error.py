@@ -35,9 +35,10 @@ class ContourError(Metric):
     over the lag. (The usual estimate, the component of the error across the velocity of
     the reference, counts lag on a curve as contour error.) Where the reference rests or
     reverses, the path is a point, and the whole distance from it counts; at a sharp
-    corner the circle is small, and almost the whole distance counts. The last sample is
-    left out, because it has no successor. If a run ends before ``start``, the figures
-    are NaN. The gradient is 0 where the distance is 0.
+    corner the circle is about as small as a step of the reference, and almost the whole
+    of a distance that is much larger counts. The last sample is left out, because it
+    has no successor. If a run ends before ``start``, the figures are NaN. The gradient
+    is 0 where the distance is 0.
     """
 
     axes: tuple[int, int] = eqx.field(static=True, default=(0, 1))

@@ -16,7 +16,8 @@ SMALL = 0.02
 """Amplitude of the multisine, as a share of the range, if the slew rate allows it."""
 
 LINES = 600
-"""Most frequencies of a multisine; about 1 % apart, they miss no resonance."""
+"""Largest number of frequencies in a multisine: about 1 % apart, so that no resonance
+is missed."""
 
 PHASES = 50
 """Number of random sets of phases; the one with the lowest crest factor is used."""

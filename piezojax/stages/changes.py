@@ -12,7 +12,7 @@ from pydantic import BaseModel
 from ..core.files import read_model, write_report
 from ..core.progress import Progress, Silent
 from ..identification import Record
-from .protocol import Gains, LostError, Stage, StoppedError
+from .protocol import Gains, Stage, StageError, StoppedError
 from .run_files import load_samples, run_file, run_files, save_samples
 from .try_gains import Motion
 
@@ -213,9 +213,9 @@ def watch(
 
     ``runs`` runs are compared with those in the folder ``baseline``. Without one, they
     become a baseline themselves, after a run that does not count. ``folder`` receives
-    the samples of every run that counts, and the report. The stage keeps ``gains``; it
-    is made safe after a failure. Raises ValueError for a ``baseline`` of another
-    reference, of other gains, without its report or with too few runs.
+    the samples of every run that counts or is stopped, and the report. The stage keeps
+    ``gains``; it is made safe after a failure. Raises ValueError for a ``baseline`` of
+    another reference, of other gains, without its report or with too few runs.
     """
     known = None
     if baseline is not None:
@@ -231,7 +231,8 @@ def watch(
             stage, gains, motion, folder, known, runs, false_alarms, progress
         )
     except BaseException:
-        with contextlib.suppress(LostError):
+        # The first error says what went wrong.
+        with contextlib.suppress(StageError):
             stage.safe()
         raise
     if known is None and len(records) == runs:

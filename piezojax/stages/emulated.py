@@ -98,7 +98,7 @@ class EmulatedStage:
     def run(self, reference: Float[np.ndarray, " samples"], gains: Gains) -> Record:
         """Follow ``reference`` (um) with ``gains``, as ``Stage.run`` describes.
 
-        Raises ValueError for a reference that is empty or not a row of numbers, too.
+        Also raises ValueError for a reference that is empty or not a row of numbers.
         """
         reference = np.asarray(reference, dtype=float)
         if reference.ndim != 1 or not np.all(np.isfinite(reference)):
@@ -133,7 +133,7 @@ class EmulatedStage:
 
     def safe(self) -> None:
         """Stop a run under way, set the safe gains and move to the safe voltage."""
-        # In turn, so that none clears the request of another one.
+        # One request at a time, so that none clears the request of another thread.
         with self._one_request:
             self._stop.set()
             with self._one_at_a_time:

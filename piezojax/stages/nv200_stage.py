@@ -129,7 +129,7 @@ class NV200Stage:
                 f"the reference goes from {np.min(reference):.6g} to "
                 f"{np.max(reference):.6g} um; the range is {low:g} to {high:g} um"
             )
-        with self._one_request:  # a later one stops the run, also during ``apply``
+        with self._one_request:  # a later request stops the run, even in ``apply``
             self._asked = False
         self.apply(gains)
         return self._do(self._follow(reference))

@@ -19,8 +19,8 @@ def run_file(folder: Path, number: int) -> Path:
 
 
 def run_files(folder: Path) -> list[Path]:
-    """Return the files of the runs in ``folder``."""
-    return sorted(folder.glob("run_*.npz"))
+    """Return the files of the runs in ``folder``, in the order of their numbers."""
+    return sorted(folder.glob("run_*.npz"), key=lambda file: int(file.stem[4:]))
 
 
 def save_samples(

@@ -109,10 +109,14 @@ def trial(
     FAR times the promised one, after which the gains from before are set. ``folder``
     receives the samples of every run, and the report after each step.
 
-    Raises ValueError if there is no motion or the stage lacks one of the gains.
+    Raises ValueError if there is no motion, one of them has no promised error, or the
+    stage lacks one of the gains.
     """
     if not motions:
         raise ValueError("a trial needs at least one reference")
+    for motion in motions:
+        if motion.promised is None:
+            raise ValueError(f"{motion.name} has no promised error to compare with")
     progress = progress or Silent()
     report = TrialReport(stage=name, gains=dict(gains), before=stage.gains())
     missing = [path for path in gains if path not in report.before]
@@ -142,7 +146,7 @@ def trial(
 
 @contextlib.contextmanager
 def safe_after_failure(stage: Stage, report: Any, file: Path) -> Iterator[None]:
-    """Write ``report`` to ``file`` at the end of this context of work on ``stage``.
+    """Context for work on ``stage`` that writes ``report`` to ``file`` at its end.
 
     If the work fails, the stage is made safe, and ``report`` receives the verdict and
     an alarm. A StageError ends here; other errors are raised again.
@@ -242,8 +246,8 @@ def abandoned(
         else:
             return "stopped", f"{cause}; the safe gains of the stage are set"
     return "lost", (
-        f"{cause}: nothing is known of the stage since; its own guard has to "
-        "make it safe. Look at it before the next run"
+        f"{cause}: nothing is known of the stage since then; only a guard of its own "
+        "can make it safe. Look at it before the next run"
     )
 
 

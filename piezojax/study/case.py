@@ -299,7 +299,7 @@ def _designed(
     fit: Fit | None,
     note: Callable[[str], None],
 ) -> System:
-    """Return the controller of the design in ``table``, with the settings beside it.
+    """Return the controller of the design in ``table``, with its settings.
 
     A fitted hysteresis without an inverse between the limits of the actuator may have
     one over the range of its record, beyond which it extrapolates. The voltage then

@@ -401,7 +401,7 @@ class Study(Table):
 
     @model_validator(mode="after")
     def _timed(self) -> "Study":
-        # A step is as long as the references, and changes at its second sample.
+        # The run of a step is as long as the references; it steps at its second sample.
         length = (round(self.references.duration * self.rate) - 1) * self.dt
         limits = [(f"constraints.{name}", name, x) for name, x in self.limits.items()]
         if self.pareto:
@@ -506,7 +506,7 @@ class Study(Table):
 
 
 def _file_keys(kind: Any) -> frozenset[str]:
-    """Return the keys with paths in the tables of a type, and in those within them."""
+    """Return the keys that hold paths in the tables of a type, at any depth."""
     if not (isinstance(kind, type) and issubclass(kind, Table)):
         return frozenset().union(*map(_file_keys, get_args(kind)))
     found: set[str] = set()
@@ -526,7 +526,7 @@ def _is_path(kind: Any) -> bool:
 
 
 _FILES = _file_keys(Study | RecordPlant | ResponsePlant)
-"""Keys of a study whose texts name files."""
+"""Keys of a study whose values name files."""
 
 
 def as_toml(study: Study, renamed: Callable[[str], str] = str) -> str:
@@ -547,7 +547,7 @@ def _with_files(content: Any, renamed: Callable[[str], str], key: str = "") -> A
 
 
 def sha256_of(study: Study) -> str:
-    """Return the SHA-256 of ``as_toml``, with file names without their folders.
+    """Return the SHA-256 of ``as_toml`` with the folders of file names left out.
 
     It identifies a study; comments and the folder of the study do not count.
     """

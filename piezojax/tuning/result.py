@@ -89,9 +89,9 @@ class FrontPoint(BaseModel):
     """Point of a Pareto front: a limit and the best gains found for it.
 
     ``kept`` tells whether the gains keep the limit. ``value`` is the worst value of the
-    limited figure on the plants of the objective, ``loss`` the objective, and
-    ``geomean_rms_um`` the geometric mean of the errors on the nominal plant, None if a
-    run diverges.
+    constrained figure on the plants for which it is constrained, ``loss`` the
+    objective, and ``geomean_rms_um`` the geometric mean of the errors on the nominal
+    plant, None if a run diverges.
     """
 
     limit: float
@@ -113,7 +113,7 @@ class Perturbed(BaseModel):
     smallest ratio of the geometric means before and after, over the plants on which
     both loops are stable; ``coupling_better`` is the median ratio of the axes at rest.
     ``constraints`` holds the outcomes of the limits on these plants, ``values`` the
-    limited figures by plant.
+    constrained figures by plant.
     """
 
     plants: int

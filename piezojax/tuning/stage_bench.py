@@ -57,7 +57,7 @@ class Bench:
                 self.stage.safe()  # the guard did not stop it
                 stopped = "the loop rings"
             if stopped or found.measured_um is None:
-                stopped = stopped or "the run has no error of the reading, measured_um"
+                stopped = stopped or "the run has no measured error (measured_um)"
                 attempt.verdict, attempt.why = "stopped", f"{motion.name}: {stopped}"
                 return
             errors.append(found.measured_um)

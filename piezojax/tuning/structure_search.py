@@ -32,7 +32,7 @@ WIDTHS = 0.2, 0.6
 """Damping ratios of the poles of a notch from which a search starts."""
 
 DEEPEST = 0.05
-"""Least depth of a notch, its gain at the centre, from which a search starts."""
+"""Gain at the centre of the deepest notch from which a search starts."""
 
 Tune = Callable[[Case, np.ndarray | None, Progress], Outcome]
 """Function ``tune(case, also, progress)`` that tunes one structure.

@@ -1,6 +1,7 @@
 """A trial of gains on a stage: what is kept, what is restored, and what is left."""
 
 import contextlib
+import dataclasses
 import json
 
 import numpy as np
@@ -15,6 +16,7 @@ from piezojax.stages import (
     TrialReport,
     trial,
 )
+from piezojax.stages.run_files import run_file, run_files, save_samples
 from piezojax.stages.try_gains import TRIAL_FILE
 
 GAINS = {"proportional": 1.0, "integral": 900.0}
@@ -72,6 +74,19 @@ def test_every_run_leaves_its_samples(tmp_path):
         assert run.measured_um == pytest.approx(np.sqrt(np.mean(error**2)))
         assert run.peak_um == pytest.approx(np.abs(error).max())
         assert run.voltage_V == (voltage.min(), voltage.max())
+
+
+def test_a_motion_without_a_promise_is_refused(tmp_path):
+    unknown = [dataclasses.replace(*motions(count=1), promised=None)]
+    with pytest.raises(ValueError, match="SIN1 has no promised error"):
+        trial(stage(), GAINS, unknown, tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_runs_are_read_in_the_order_of_their_numbers(tmp_path):
+    for number in (9, 10, 99, 100):
+        save_samples(run_file(tmp_path, number), *np.ones((3, 5)))
+    assert run_files(tmp_path) == [run_file(tmp_path, n) for n in (9, 10, 99, 100)]
 
 
 def test_a_broken_promise_restores_the_gains_from_before(tmp_path):

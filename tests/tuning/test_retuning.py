@@ -500,7 +500,7 @@ def test_a_run_without_a_measured_error_is_named(tmp_path, monkeypatch):
     attempt = Attempt(gains=GOOD)
     Bench(stage(), [motion], tmp_path, report, 9, Silent()).measure(attempt)
     assert attempt.verdict == "stopped"
-    assert attempt.why.endswith(": the run has no error of the reading, measured_um")
+    assert attempt.why.endswith(": the run has no measured error (measured_um)")
 
 
 @pytest.mark.parametrize(

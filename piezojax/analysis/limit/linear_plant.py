@@ -147,18 +147,18 @@ def _responses(plant: LinearPlant, voltage: jax.Array, rest: jax.Array) -> jax.A
 def gain_from_noise(
     response: np.ndarray, displacement: np.ndarray, noise: np.ndarray
 ) -> float:
-    """Return the factor that scales the response of a linear plant to the stage's.
+    """Return the gain of the stage relative to a linear plant.
 
-    Only the part of the voltage that sensor noise causes counts. All arguments are
-    transforms [..., lines]. ``response`` is that of the linear plant to the voltage and
+    The gain is that for voltage caused by sensor noise. All arguments are transforms
+    [..., lines]. ``response`` is that of the linear plant to the voltage and
     ``displacement`` that of the stage, both without the part that the reference
     predicts; ``noise`` is the sensor's.
 
-    The factor is an instrumental-variable estimate with the noise as instrument: the
+    The gain is an instrumental-variable estimate with the noise as instrument: the
     residual displacement is then uncorrelated with the noise, as a disturbance must be.
     Lines are weighted by 1 / (power of the residual), updated in each iteration. A
     hysteresis responds less to small fast motions than to large slow ones. The
-    reference predicts the large ones; feedback acts on the small ones, so the factor is
+    reference predicts the large ones; feedback acts on the small ones, so the gain is
     estimated from these. Raises ValueError if the estimate is not positive.
     """
     runs = tuple(range(response.ndim - 1))

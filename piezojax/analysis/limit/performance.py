@@ -63,8 +63,9 @@ def performance_limit(
     ``references`` [names, samples] in um; ``noise`` [names, draws, samples], draws of
     unit variance; ``disturbance`` in um, if any, broadcasts to the shape of the noise.
     They are the fields of the tuner's Signals. Samples before ``start`` do not count.
-    ``segment`` (s) is the length of the windows of the spectra, at most that of the
-    samples on which signals are predicted; ``dt`` (s) is by default that of the loop.
+    ``segment`` (s) is the length of the windows of the spectra. A window is never
+    longer than the samples on which a ReferencePredictor predicts. ``dt`` (s) is by
+    default that of the loop.
 
     Raises ValueError for several axes, a sensor without noise, runs that diverge, and
     a plant that is unstable or does not move as its linear model does.

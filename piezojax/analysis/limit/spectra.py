@@ -16,8 +16,8 @@ TAPS = 100
 tenth of a second."""
 
 LEAST_SHARE = 1e-10
-"""Smallest eigenvalue, relative to the largest, whose direction the fit of the taps
-keeps."""
+"""Smallest eigenvalue, relative to the largest, whose eigenvector the fit of the taps
+uses."""
 
 
 class ReferencePredictor:

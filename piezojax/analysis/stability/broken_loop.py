@@ -180,10 +180,10 @@ def broken_loop(loop: Feedback, at: Any = 0.0) -> BrokenLoop:
     Far along a branch, b + h tends to -a/c, the slope of the axis of the hysteresis
     loop. For a plant without kinks both branches are the same.
 
-    Limits (Saturation) are removed from the actuator and the sensor, because margins
-    hold for small motions, and so are converters (Quantiser), on whose steps no loop
-    rests exactly. A slew limit has its slope at rest, 1. A switching term
-    (``BangBang``) has slope 0 and does not count.
+    Limits (Saturation) and converters (Quantiser) are removed from the actuator and the
+    sensor: margins hold for small motions, and no loop rests exactly on the steps of a
+    converter. A slew limit has its slope at rest, 1. A switching term (``BangBang``)
+    has slope 0 and does not count.
     """
     point = OperatingPoint.at(at)
     return cut(loop, point.signal, point.side, point.state)

@@ -411,7 +411,7 @@ def _delay_margin(sensitivity: Complex[Array, " lines"]) -> Float[Array, ""]:
 def _least_of_axes(
     margin: Callable[[Array], Array], sensitivity: Sensitivity
 ) -> Float[Array, ""]:
-    """Return the least ``margin`` of the axes; 0 where |S| exceeds ``NO_MARGIN``."""
+    """Return the least ``margin`` of the axes, 0 if an |S| exceeds ``NO_MARGIN``."""
 
     def left(axis: Complex[Array, " lines"]) -> Float[Array, ""]:
         return jnp.where(jnp.max(jnp.abs(axis)) > NO_MARGIN, 0.0, margin(axis))

@@ -20,8 +20,8 @@ class MeasuredMargins(BaseModel):
     loop is stable. ``sensitivity_peak`` is the largest |S| at a line, at
     ``sensitivity_peak_Hz``. ``gain_margin_dB`` is the smallest gain above 1 that makes
     the loop unstable, ``phase_margin_deg`` the smallest such phase, lag or lead, and
-    ``delay_margin_samples`` the smallest such delay. Crossings are interpolated between
-    two lines; a margin without such a crossing is None. The lines extend from
+    ``delay_margin_samples`` the smallest such delay. Each is interpolated between two
+    lines, and None if no such change moves L to -1 within the lines. They extend from
     ``lowest_Hz`` to ``highest_Hz``; nothing is known outside this band.
     """
 

@@ -42,7 +42,7 @@ class OperatingPoint:
 
     @classmethod
     def at(cls, place: Any) -> "OperatingPoint":
-        """Return ``place`` if it is an OperatingPoint, else one with this reference."""
+        """Return ``place`` if it is an OperatingPoint, else one at this reference."""
         return place if isinstance(place, OperatingPoint) else cls(place)
 
     @property

@@ -44,7 +44,8 @@ def nv200(
     ``scale`` (V/um) is that of the device; 0 stands for the assumed one. ``slew`` um/s
     limits the setpoint, and ``range`` (um) are the ends of the device's range, by
     default the displacements at the limits. ``dt`` in s. Raises ValueError for a plant
-    without positive gain, another rate than 20 kHz, and as ``design_model``.
+    without positive gain, for another rate than 20 kHz, and in the cases of
+    ``design_model`` and ``DesignModel.fastest_stable``.
     """
     model = _rising(plant, dt, limits)
     lowest, highest = range or (float(rest_output(plant, end)) for end in limits)
@@ -87,7 +88,8 @@ def e727(
 ) -> E727:
     """Return an E-727 whose integral and notch suit the plant between ``limits`` (V).
 
-    The notch lies at 9 kHz, the highest frequency of the device, if the mode is above.
+    The notch lies at the plant's strongest mode, but not above 9 kHz, the limit of the
+    device.
     ``scale`` (V/um) is that of the device; ``slew`` um/s limits the setpoint, and
     ``dt`` is in s. Raises ValueError as ``nv200``.
     """

@@ -136,7 +136,7 @@ class NV200(Device):
         """Return the device with its parameters rounded as they are typed in.
 
         Rounding could make the notch a hertz wider than its limit of 2 notchf.
-        Therefore the width is first limited to twice notchf rounded down.
+        Therefore the width is first limited to 2 floor(notchf).
         """
         width = jnp.minimum(self.notchb, 2.0 * jnp.floor(self.notchf))
         return rounded_fields(dataclasses.replace(self, notchb=width))

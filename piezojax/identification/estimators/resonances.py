@@ -69,8 +69,8 @@ class LinearDynamics(NamedTuple):
     ``delay`` is in excess of the one sample between input and output. ``slope`` is that
     of the output over the full range of the input, below the resonances. Both are None
     if no dynamics could be identified. ``whitening`` is the filter of the errors.
-    ``slew`` is the slew rate of the input, whose unit is ``input_unit``, per s; None if
-    it shows no limit.
+    ``slew`` is the slew rate of the input in ``input_unit`` per s, None if the input
+    shows no limit.
     """
 
     modes: tuple[Resonance, ...] = ()

@@ -23,7 +23,7 @@ OFTEN = 0.01
 
 
 class Coverage(BaseModel):
-    """Band (Hz) that the records excite, and the range of their input.
+    """Band (Hz) that the records excite, and the range of their first input.
 
     The band is None if no line can be distinguished from noise.
     """
@@ -36,9 +36,10 @@ class Coverage(BaseModel):
 class Unseen(BaseModel):
     """Frequencies (Hz) and inputs of the validation part that training does not cover.
 
-    ``band_Hz`` goes from the lowest to the highest new line of all inputs.
-    ``input_range`` is that of the first ``input`` (from 0) that leaves its training
-    range, over the validation parts that leave it. Each is None if training covers it.
+    ``band_Hz`` goes from the lowest to the highest new line of all inputs. ``input`` is
+    the number, from 0, of the first input that leaves its training range, and
+    ``input_range`` its range in the validation parts that leave it. ``band_Hz`` and
+    ``input_range`` are None if there is nothing new.
     """
 
     band_Hz: tuple[float, float] | None  # noqa: N815
@@ -63,7 +64,7 @@ def coverage_of(records: Sequence[Record], bound: ErrorBound | None) -> Coverage
 def unseen_in(records: Sequence[Record], train: slice, validate: slice) -> Unseen:
     """Return the frequencies and inputs in ``validate`` that ``train`` lacks.
 
-    ``train`` covers what it holds in any of the ``records``.
+    A line or a range counts as covered if ``train`` of any record covers it.
     """
     dt, parts = records[0].dt, (train, validate)
     found = [
@@ -84,7 +85,7 @@ def unseen_in(records: Sequence[Record], train: slice, validate: slice) -> Unsee
 def _unseen(
     number: int, inputs: Sequence[np.ndarray], dt: float, train: slice, validate: slice
 ) -> Unseen:
-    """Return what ``validate`` holds of an input [samples] and ``train`` lacks."""
+    """Return the Unseen of input ``number``; ``inputs`` are its samples by record."""
     import scipy.signal  # takes long to import
 
     trained, validated = ([x[part] for x in inputs] for part in (train, validate))

@@ -30,7 +30,7 @@ ENOUGH = 4
 """Least number of lines on a side of a peak."""
 
 NEAR = 0.8, 1.25
-"""Ratios of frequency between which lines belong to one peak."""
+"""Bounds on the ratio of two frequencies of the same peak."""
 
 MOST = 3
 """Largest number of peaks in a report."""
@@ -79,7 +79,7 @@ def unmodelled_peaks(found: RelativeError) -> list[Peak]:
 
 
 def joined_peaks(each: Sequence[Sequence[Peak]]) -> list[Peak]:
-    """Return the peaks of several records; of those at one place, the largest."""
+    """Return the peaks of several records, the largest of those ``NEAR`` each other."""
     if len(each) == 1:
         return list(each[0])
     kept: list[Peak] = []

@@ -129,10 +129,11 @@ def model_faults(
 def _relative(
     records: Sequence[Record], runs: Sequence[np.ndarray], validate: slice
 ) -> tuple[ErrorBound | None, list[RelativeError]]:
-    """Return the bound over the whole records and the error of each over validation.
+    """Return the bound over the whole records, and the relative errors over validation.
 
-    A record whose validation part is short or constant has no error. The bound is None
-    if there is none, for records of several channels, and for short or constant ones.
+    Records with a short or constant validation part are left out of the errors. The
+    bound is None, and there are no errors, if all are left out, if a whole record is
+    short or constant, and for records of several channels.
     """
     channels = {(r.inputs.shape[1], r.outputs.shape[1]) for r in records}
     if channels != {(1, 1)}:
@@ -174,7 +175,7 @@ def _response_warnings(errors: Iterable[RelativeError]) -> Iterator[str]:
 
 
 def _wrong_from(found: RelativeError) -> float | None:
-    """Return the frequency (Hz) from which the model is wrong, None if it is not."""
+    """Return the start (Hz) of a wrong response (``WIDE``), None without one."""
     seen = found.gain > VISIBLE * found.gain[0]
     wrong = found.sure & (found.lower > LEAST) & seen
     for i in np.flatnonzero(wrong):
