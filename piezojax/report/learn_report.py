@@ -15,6 +15,7 @@ from .figures import (
     add_title,
     figure,
     legend_above,
+    plain_tick_labels,
     plot_style,
     write,
 )
@@ -43,6 +44,7 @@ def _figure(report: LearnReport, folder: Path, dt: float) -> Figure:
     runs.plot(np.arange(1, len(measured) + 1), measured, "o-", color=AFTER, ms=4)
     runs.set(yscale="log", xlabel="run", ylabel="rms error (nm)")
     runs.set(xticks=range(1, len(measured) + 1))
+    plain_tick_labels(runs.yaxis)
     shown = {"first run": (0, BEFORE), f"run {report.best + 1}": (report.best, AFTER)}
     for label, (place, colour) in shown.items():
         wanted, reading, _ = load_samples(folder / report.runs[place].file)

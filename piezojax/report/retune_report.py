@@ -19,6 +19,7 @@ from .figures import (
     add_title,
     figure,
     legend_above,
+    plain_tick_labels,
     plot_style,
     write,
 )
@@ -87,6 +88,7 @@ def _draw_attempts(panel: Axes, report: RetuneReport) -> None:
             panel.plot(*zip(*known.items(), strict=True), **style, label=name[:-3])
     panel.set(yscale="log", ylabel="rms error (nm)", xlabel="attempt")
     panel.set(xticks=range(1, len(report.attempts) + 1))
+    plain_tick_labels(panel.yaxis)
     legend_above(panel)
 
 

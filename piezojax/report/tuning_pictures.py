@@ -25,6 +25,7 @@ from .figures import (
     add_title,
     figure,
     legend_above,
+    plain_tick_labels,
     plot_style,
     write,
 )
@@ -242,12 +243,17 @@ def convergence_figure(outcome: Outcome) -> Figure:
         )
     if geometric:
         ax.axhline(1.0, color=BEFORE, lw=1.0, ls="--", label="gains before")
-        ax.set(
-            ylabel="error, geometric mean of all\nreferences, relative to before (-)",
-            yscale="log",
+        # On several axes the errors of axes at rest count as well, with their weight.
+        joined = (
+            "errors of all axes, at rest too,\nweighted geometric mean"
+            if outcome.case.study.axes
+            else "error, geometric mean of all\nreferences"
         )
+        ax.set(ylabel=f"{joined}, relative to before (-)", yscale="log")
+        plain_tick_labels(ax.yaxis)
     else:
         ax.set(ylabel="objective (-)")
     ax.set(xlabel=f"step of {outcome.result.method}", title="Convergence")
+    ax.locator_params(axis="x", integer=True)
     ax.legend()
     return picture

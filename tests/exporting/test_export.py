@@ -103,7 +103,7 @@ def test_the_header_says_that_changed_parameters_leave_a_solved_start(tmp_path):
     )
     for system, said in ((model, True), (PLANTS["p753"](), False)):
         header, *_ = pj.export(system, tmp_path / f"{said}", about=ABOUT)
-        assert ("changed parameters do not" in header.read_text()) == said
+        assert ("does not begin at rest" in header.read_text()) == said
 
 
 @compiled
