@@ -48,13 +48,8 @@ def disturbance_observer_sliding_mode(
     model = design_model(plant, dt, limits)
     # The observer holds the whole gain from V to um; the model has unit gain.
     dynamics = scaled_to_dc(model.dynamics, 1.0)
-    slope = model.gain()
-    gain = slope * model.dynamics.dc_gain()
-    if gain <= 0.0:
-        raise ValueError(
-            f"the output falls as the voltage rises, {gain:.6g} um/V between the "
-            "limits; the disturbance observer needs a gain above 0"
-        )
+    model.check_rising("the disturbance observer needs a gain above 0")
+    gain = model.total_gain()
 
     def observed(pace: float) -> DisturbanceObserverControl:
         return DisturbanceObserverControl(
@@ -65,7 +60,7 @@ def disturbance_observer_sliding_mode(
             dt,
         )
 
-    return model.fastest_stable(observed, Affine(slope))
+    return model.fastest_stable(observed, Affine(model.gain()))
 
 
 def inversion_pid(plant: System, dt: float, limits: Limits) -> InversionControl:

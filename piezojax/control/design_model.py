@@ -82,6 +82,19 @@ class DesignModel(NamedTuple):
         rise = rest_output(self.static, upper) - rest_output(self.static, lower)
         return rise / (upper - lower)
 
+    def total_gain(self) -> Scalar:
+        """Return the mean slope of the plant between the limits at rest, um/V."""
+        return self.gain() * self.dynamics.dc_gain()
+
+    def check_rising(self, need: str) -> None:
+        """Raise ValueError, which ends with ``need``, unless ``total_gain`` is > 0."""
+        gain = float(self.total_gain())
+        if gain <= 0.0:
+            raise ValueError(
+                f"the output falls as the voltage rises, {gain:.6g} um/V between the "
+                f"limits; {need}"
+            )
+
     def fastest_stable(
         self, make: Callable[[float], S], static: System | None = None
     ) -> S:

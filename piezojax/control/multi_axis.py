@@ -114,7 +114,7 @@ class MultiAxisSlidingMode(Designed):
         """Return the controller with its gain matrices computed."""
         # Packed into arrays: XLA would copy scalar terms into every result that has
         # them, and take several times as long to compile.
-        A, B = map(packed_matrices, (self.model.autoregressive, self.model.moving))
+        A, B = self.model.packed()
         S = packed_matrices(map(as_full, self.surface))
         PHI = packed_matrix(as_full(self.reaching))
         lags, q = len(B) - 1, self.model.axes
@@ -196,7 +196,7 @@ class ResolvedMultiAxis(System):
         measured, applied = map(as_scalars, (input.measured, input.applied))
         p = len(self.surface)
         # Packed, as in ``MultiAxisSlidingMode.resolved``.
-        A, B = map(packed_matrices, (self.model.autoregressive, self.model.moving))
+        A, B = self.model.packed()
         r = jnp.stack(desired)
         # At rest u1 equals its past: (I + (p-1) K_s) u1 = F1 R1.
         wanted = packed_matrix(self.forward) @ (r - A.sum(0) @ r)

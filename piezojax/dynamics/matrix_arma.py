@@ -53,11 +53,15 @@ class MatrixARMA(System):
         """Number of inputs and of outputs q."""
         return len(self.moving[0])
 
+    def packed(self) -> tuple[jax.Array, jax.Array]:
+        """Return ``autoregressive`` and ``moving`` as packed arrays [p, q, q]."""
+        return packed_matrices(self.autoregressive), packed_matrices(self.moving)
+
     def responses(self) -> jax.Array:
         """Return the Markov parameters h_0 = C B, h_1 = C A B, ..., (7.6) [p, q, q]."""
-        A = packed_matrices(self.autoregressive)
+        A, B = self.packed()
         responses: list[jax.Array] = []
-        for moved in packed_matrices(self.moving):
+        for moved in B:
             for a, h in zip(A, reversed(responses), strict=False):
                 moved = moved + a @ h
             responses.append(moved)

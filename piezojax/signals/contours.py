@@ -130,7 +130,7 @@ def signals_of(name: str) -> tuple[str, str]:
             return f"{waves[0]}{first}", f"{waves[1]}{second}"
         if kind == "RASTER":
             # Without an exponent, which the name of a signal cannot hold.
-            slow = second or f"{Decimal(str(Fraction(first) / LINES * 1.0)):f}"
+            slow = second or f"{Decimal(str(float(Fraction(first) / LINES))):f}"
             return f"SCAN{first}", f"TRI{slow}"
     raise ValueError(
         f"contour {shown(name)} is unknown; it must have the form of one of "

@@ -113,17 +113,12 @@ def e727(
 
 def _rising(plant: System, dt: float, limits: Limits) -> DesignModel:
     model = design_model(plant, dt, limits)
-    slope = float(model.gain() * model.dynamics.dc_gain())
-    if slope <= 0.0:
-        raise ValueError(
-            f"the output falls as the voltage rises, {slope:.6g} um/V between the "
-            "limits; the gains of the device are positive"
-        )
+    model.check_rising("the gains of the device are positive")
     return model
 
 
 def _designed(model: DesignModel, plant: System, device: Callable[[Start], D]) -> D:
-    gain = float(model.gain() * model.dynamics.dc_gain())
+    gain = float(model.total_gain())
     middle = rest_output(plant, 0.5 * sum(model.limits))
     modes = plant_modes(plant, middle, model.dt)
     strongest = max(modes, key=lambda mode: mode.gain, default=None)
