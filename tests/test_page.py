@@ -3,11 +3,13 @@
 import re
 from pathlib import Path
 
+import pytest
 from page_reader import Reader
 from rich.table import Table
 from rich.text import Text
 
 import piezojax
+from piezojax.report.figures import figure, plain_tick_labels
 from piezojax.report.live_figures import LiveFigures
 from piezojax.report.page import PICTURES, Page, page_html, table_html
 from piezojax.report.summary_tables import reproduction_table
@@ -63,3 +65,22 @@ def test_every_picture_has_a_caption():
     # A metric and a number stand in the other names; the caption is that name.
     computed = {"{FIGURE}.png", "{name}.png", "singular_values_{number}.png"}
     assert {*re.findall(r'f"([^"]+\.png)"', text)} == computed
+
+
+@pytest.mark.parametrize(
+    ("ends", "labels"),
+    [
+        ((0.6, 1.9), ["0.6", "0.7", "0.8", "0.9", "1", "2"]),
+        ((0.05, 2.0), ["0.05", "0.1", "0.2", "0.5", "1", "2"]),
+    ],
+)
+def test_a_short_logarithmic_axis_has_several_labels(ends, labels):
+    picture = figure(4.0, 3.0)
+    ax = picture.subplots()
+    ax.plot(ends)
+    ax.set_yscale("log")
+    plain_tick_labels(ax.yaxis)
+    picture.canvas.draw()
+    low, high = ax.get_ylim()
+    ticks = zip(ax.get_yticks(), ax.get_yticklabels(), strict=True)
+    assert [text.get_text() for at, text in ticks if low <= at <= high] == labels

@@ -72,8 +72,14 @@ def legend_above(ax: Axes) -> None:
 
 
 def plain_tick_labels(axis: Axis) -> None:
-    """Label a short logarithmic ``axis`` at 1, 2 and 5 with numbers, not powers."""
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    """Label a short logarithmic ``axis`` with numbers, not powers.
+
+    Call it after the curves are drawn. The labels are at 1, 2 and 5, or, if the axis
+    may hold only one of these, at every digit.
+    """
+    low, high = axis.get_view_interval()
+    digits = (1.0, 2.0, 5.0) if high >= 5.0 * low else range(1, 10)
+    axis.set_major_locator(LogLocator(subs=digits))
     axis.set_major_formatter(FormatStrFormatter("%g"))
     axis.set_minor_formatter(NullFormatter())
 
