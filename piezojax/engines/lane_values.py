@@ -105,11 +105,6 @@ class LaneValues:
         shape, column = self._find(self.step.places[number])
         return typed(self._arrays[shape][..., column], kind)
 
-    def read(self, numbers: Iterable[int]) -> list[Place]:
-        """Return the places of the inputs among the nodes ``numbers``."""
-        places = (self.step.place(number) for number in numbers)
-        return [place for place in places if place is not None]
-
     def is_shared(self, place: Place) -> bool:
         """Return whether an element has the same value in all lanes."""
         return math.prod(self._find(place)[0]) == 1

@@ -11,9 +11,10 @@ from jaxtyping import Array
 
 from .lane_values import LaneValues
 from .native_library import registered
-from .native_source import Shape, has_source, shape_for, source
+from .native_source import Shape, has_source, shape_for, source, waits
 from .native_writer import Arrays, Rows
 from .scalar_step import Place, ScalarStep
+from .shorter_chain import shortened
 
 
 def computes(step: ScalarStep, by_lane: bool) -> bool:
@@ -38,6 +39,8 @@ def results(
     they are returned instead of the values.
     """
     _, outer, inner = counts
+    if waits(step, inner):
+        step = shortened(step)
     blocks = _Blocks(shape_for(step, inner, every), counts)
     leaves, rows = blocks.inputs(inputs)
     carried = [each.place for each in step.carried]
@@ -161,14 +164,14 @@ def _arrays(
     step: ScalarStep, values: LaneValues, wanted: Collection[tuple[int, int]]
 ) -> Arrays:
     """Return the arrays of a step; ``wanted`` are elements of the carry."""
-    numbers = values.read(step.steady)
+    numbers = step.read(step.steady)
     shared = [place for place in numbers if values.is_shared(place)]
     ends = [
         [x.place for x in each if (x.place.leaf, x.place.element) in wanted]
         for each in (step.carried, step.slopes)
     ]
     own = [place for place in numbers if not values.is_shared(place)]
-    return Arrays(shared, own, values.read(step.steady_slopes), *ends)
+    return Arrays(shared, own, step.read(step.steady_slopes), *ends)
 
 
 def _at(places: Sequence[Any], wanted: Sequence[Any], array: Array) -> Array:

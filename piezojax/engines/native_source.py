@@ -27,9 +27,9 @@ EXTREMES = ("max", "min")
 GROUP = 8
 """Lanes of an inner loop: the numbers of an AVX-512 register."""
 
-PAIRED = 400
-"""Number of operations of a step below which two groups of lanes run in turn, because a
-single group mostly waits for its own results."""
+SHORT = 400
+"""Number of operations below which a step mostly waits for its own results. Two groups
+of lanes then run in turn; a single group gets a shorter chain of operations."""
 
 
 class Shape(NamedTuple):
@@ -47,9 +47,14 @@ class Shape(NamedTuple):
 
 def shape_for(step: ScalarStep, lanes: int, every: int, segment: int = 0) -> Shape:
     """Return the fastest shape for a number of lanes."""
-    short = len(step.moving) < PAIRED and (segment > 0 or not step.slopes)
+    short = len(step.moving) < SHORT and (segment > 0 or not step.slopes)
     paired = lanes > GROUP and short
     return Shape(1 if lanes == 1 else GROUP, 2 if paired else 1, every, segment)
+
+
+def waits(step: ScalarStep, lanes: int) -> bool:
+    """Return whether a run without derivatives mostly waits for its own results."""
+    return lanes <= GROUP and len(step.moving) < SHORT and not step.slopes
 
 
 def has_source(step: ScalarStep) -> bool:

@@ -74,6 +74,11 @@ class ScalarStep(NamedTuple):
         node = self.graph.nodes[number]
         return self.places[int(node.value)] if node.operation == INPUT else None
 
+    def read(self, numbers: Iterable[int]) -> list[Place]:
+        """Return the places of the inputs among the nodes ``numbers``."""
+        places = (self.place(number) for number in numbers)
+        return [place for place in places if place is not None]
+
     @property
     def last(self) -> list[int]:
         """The nodes of all results of the step."""

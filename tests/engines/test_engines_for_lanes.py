@@ -269,9 +269,10 @@ def loop_lanes(name):
 
 
 @needs_compiler
+@pytest.mark.parametrize("lanes", [1, 8, 17])
 @pytest.mark.parametrize("name", LOOPS)
-def test_loops_in_c(name):
-    assert_engine_equals_loop("native", loop_lanes(name), spread(17))
+def test_loops_in_c(name, lanes):
+    assert_engine_equals_loop("native", loop_lanes(name), spread(lanes))
 
 
 @pytest.mark.parametrize("in_registers", [True, False])

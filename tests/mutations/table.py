@@ -16,6 +16,7 @@ class Mutation(NamedTuple):
     tests: tuple[str, ...]
 
 
+_CHAIN = "tests/engines/test_shorter_chain.py"
 _DATA = "tests/tuning/test_data.py"
 _ENGINES = "tests/engines/test_engines_for_lanes.py"
 _LOOPS = "tests/control/test_loops.py"
@@ -38,6 +39,13 @@ MUTATIONS = (
         "start + block * $carried * STRIDE",
         "start + 0 * block * $carried * STRIDE",
         (_ENGINES, "-k", "number_of_lanes"),
+    ),
+    Mutation(
+        "a sum of few lanes with the sign of an inner term",
+        "engines/shorter_chain.py",
+        "Term(outer.sign * inner.sign, factor, inner.node)",
+        "Term(inner.sign, factor, inner.node)",
+        (_CHAIN, "-k", "equal"),
     ),
     Mutation(
         "derivatives of the state that vanish for good",
