@@ -66,32 +66,31 @@ def unseen_in(records: Sequence[Record], train: slice, validate: slice) -> Unsee
 
     A line or a range counts as covered if ``train`` of any record covers it.
     """
-    dt, parts = records[0].dt, (train, validate)
-    found = [
-        _unseen(number, [record.inputs[:, number] for record in records], dt, *parts)
-        for number in range(records[0].inputs.shape[1])
-    ]
-    bands = [one.band_Hz for one in found if one.band_Hz is not None]
-    beyond = next((one for one in found if one.input_range is not None), found[0])
+    bands, ranges = [], {}
+    for number in range(records[0].inputs.shape[1]):
+        trained, validated = (
+            [x for record in records if (x := record.inputs[part, number]).size]
+            for part in (train, validate)
+        )
+        bands += _new_lines(trained, validated, records[0].dt)
+        if (beyond := _new_range(trained, validated)) is not None:
+            ranges[number] = beyond
+    first = min(ranges, default=0)
     return Unseen(
-        band_Hz=(min(low for low, _ in bands), max(high for _, high in bands))
-        if bands
-        else None,
-        input_range=beyond.input_range,
-        input=beyond.input,
+        band_Hz=(float(min(bands)), float(max(bands))) if bands else None,
+        input_range=ranges.get(first),
+        input=first,
     )
 
 
-def _unseen(
-    number: int, inputs: Sequence[np.ndarray], dt: float, train: slice, validate: slice
-) -> Unseen:
-    """Return the Unseen of input ``number``; ``inputs`` are its samples by record."""
+def _new_lines(
+    trained: Sequence[np.ndarray], validated: Sequence[np.ndarray], dt: float
+) -> list[float]:
+    """Return the frequencies (Hz) of strong lines that no training part has."""
     import scipy.signal  # takes long to import
 
-    trained, validated = ([x[part] for x in inputs] for part in (train, validate))
     longest = min(max(x.size for x in parts) for parts in (trained, validated))
     size = 2 ** int(np.log2(max(8, longest // 4)))
-    frequency = np.fft.rfftfreq(size, dt)
     known, powers = (
         [
             scipy.signal.welch(x, nperseg=size, detrend="linear")[1]
@@ -100,35 +99,25 @@ def _unseen(
         ]
         for parts in (trained, validated)
     )
+    frequency = np.fft.rfftfreq(size, dt)
     # A line next to one that was trained on is leakage of the window.
     known = [np.convolve(power, np.ones(5), mode="same") for power in known]
     covered = np.max([np.zeros(frequency.size), *known], axis=0)
-    new = np.flatnonzero(
-        np.any(
-            [
-                (power > STRONG * power.max()) & (covered < NEW * power)
-                for power in [np.zeros(frequency.size), *powers]
-            ],
-            axis=0,
-        )
-    )
-    low = min(x.min() for x in trained if x.size)
-    high = max(x.max() for x in trained if x.size)
+    new = [(x > STRONG * x.max()) & (covered < NEW * x) for x in powers]
+    return [x for each in new for x in frequency[each]]
+
+
+def _new_range(
+    trained: Sequence[np.ndarray], validated: Sequence[np.ndarray]
+) -> tuple[float, float] | None:
+    """Return the range of the validation parts that leave that of training, if any."""
+    low, high = min(x.min() for x in trained), max(x.max() for x in trained)
     margin = BEYOND * (high - low)
     outside = [
         x
         for x in validated
-        if x.size and np.mean((x < low - margin) | (x > high + margin)) > OFTEN
+        if np.mean((x < low - margin) | (x > high + margin)) > OFTEN
     ]
-    return Unseen(
-        band_Hz=(float(frequency[new[0]]), float(frequency[new[-1]]))
-        if new.size
-        else None,
-        input_range=(
-            float(min(x.min() for x in outside)),
-            float(max(x.max() for x in outside)),
-        )
-        if outside
-        else None,
-        input=number,
-    )
+    if not outside:
+        return None
+    return float(min(x.min() for x in outside)), float(max(x.max() for x in outside))
