@@ -10,11 +10,8 @@ from jaxtyping import Array, Float
 
 from .arrays import Signal, State, as_array, as_signal
 from .parameter import PartUnits
+from .root import root
 from .system import System, at_rest, resolve, rest_output
-
-STEPS, NEWTON = 64, 1e-12
-"""Largest number of Newton steps, and the change, relative to 1 V plus the input, up to
-which they end."""
 
 
 class Observation(NamedTuple):
@@ -201,27 +198,11 @@ def _holding_input(plant: System, output: Signal) -> Signal:
     wanted, signal = ravel_pytree(output)
     arrays, static = eqx.partition(plant, eqx.is_array)
 
-    @jax.jit
-    def improved(arrays: Any, wanted: Array, input: Array) -> Array:
-        def missed(input: Array) -> Array:
-            found = rest_output(eqx.combine(arrays, static), signal(input))
-            return ravel_pytree(found)[0] - wanted
-
-        if input.size == 1:  # faster to compile
-            value, slope = jax.jvp(missed, (input,), (jnp.ones_like(input),))
-            return input - value / slope
-        return input - jnp.linalg.solve(jax.jacfwd(missed)(input), missed(input))
-
-    def advance(carry: tuple) -> tuple:
-        count, input, _ = carry
-        better = improved(*fixed, input)
-        change = jnp.abs(better - input)
-        return count + 1, better, jnp.any(change > NEWTON * (1.0 + jnp.abs(input)))
+    def missed(given: tuple, input: Array) -> Array:
+        arrays, wanted = given
+        found = rest_output(eqx.combine(arrays, static), signal(input))
+        return ravel_pytree(found)[0] - wanted
 
     start = wanted if isinstance(output, tuple) else jnp.zeros_like(wanted)
-    fixed, start = jax.lax.stop_gradient(((arrays, wanted), start))
-    goes_on = lambda carry: (carry[0] < STEPS) & carry[2]  # noqa: E731
-    found = jax.lax.while_loop(goes_on, advance, (0, start, jnp.array(True)))[1]
-    # One more step, outside the loop, gives the root its derivative.
-    found = improved(arrays, wanted, found)
+    found = root(missed, (arrays, wanted), start)
     return signal(jnp.where(jnp.isfinite(found), found, 0.0))

@@ -3,11 +3,11 @@
 from typing import Any
 
 import jax.numpy as jnp
-import optimistix as optx
 from jaxtyping import Array, Float
 
 from ..core.arrays import as_array
 from ..core.parameter import parameter
+from ..core.root import root
 from ..core.system import System
 
 
@@ -63,13 +63,11 @@ class NeuralStateSpace(System):
     def init(self, input: Any = 0.0) -> Float[Array, " n"]:
         """Return the state at rest under ``input``, by Newton's method from zero."""
         zero = jnp.zeros_like(self.state_matrix[0])
-        rest = optx.root_find(
-            lambda state, _: self._next(state, input) - state,
-            optx.Newton(rtol=1e-12, atol=1e-12),
+        rest = root(
+            lambda given, state: given[0]._next(state, given[1]) - state,
+            (self, as_array(input)),
             zero,
-            max_steps=64,
-            throw=False,
-        ).value
+        )
         return jnp.where(jnp.isfinite(rest), rest, zero)
 
     def step(
