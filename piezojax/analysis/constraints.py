@@ -11,9 +11,10 @@ from jaxtyping import Array, Float
 from ..core.arrays import largest, smallest
 from ..core.feedback import Feedback
 from ..core.metrics import ExtremeFigures, TrackingFigures
-from .stability.differentiable import (
+from .stability.model_error import worst_delay_margin, worst_sensitivity
+from .stability.operating_point import BRANCHES, OperatingPoint
+from .stability.sampled_margins import (
     BANDS,
-    Sensitivity,
     bandwidth_of,
     closed_loop_peak_of,
     delay_margin_of,
@@ -22,11 +23,12 @@ from .stability.differentiable import (
     largest_by_band,
     peaks_of,
     phase_margin_of,
+)
+from .stability.small_motion import (
+    Sensitivity,
     references_followed,
     sensitivities,
 )
-from .stability.model_error import worst_delay_margin, worst_sensitivity
-from .stability.operating_point import BRANCHES, OperatingPoint
 from .step_response import NAMES as STEPS
 from .step_response import StepFigures
 

@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Complex, Float
 from pydantic import BaseModel
 
-from ..analysis.stability.differentiable import (
+from ..analysis.stability.operating_point import OperatingPoint
+from ..analysis.stability.small_motion import (
     lines,
     references_followed,
     sensitivities,
 )
-from ..analysis.stability.operating_point import OperatingPoint
 from ..core.error_bound import ErrorBound
 from ..core.feedback import Feedback
 from ..core.files import write_report, write_text

@@ -11,8 +11,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..analysis.stability import OperatingPoint, open_loop
-from ..analysis.stability.differentiable import peak_of, sensitivities
 from ..analysis.stability.operating_point import BRANCHES
+from ..analysis.stability.sampled_margins import peak_of
+from ..analysis.stability.small_motion import sensitivities
 from ..core.axes import PerAxisMetric, packed
 from ..core.feedback import Feedback, loop_inputs
 from ..core.metrics import Chosen, Tracking

@@ -16,8 +16,8 @@ from ..analysis.constraints import (
     uses,
     worst_excess,
 )
-from ..analysis.stability.differentiable import lines
 from ..analysis.stability.operating_point import OperatingPoint
+from ..analysis.stability.small_motion import lines
 from ..analysis.step_response import StepFigures, step_ends
 from ..core.arrays import as_array
 from ..core.feedback import Feedback

@@ -11,8 +11,11 @@ import numpy as np
 import scipy.stats.qmc
 
 from ..analysis.constraints import CONSTRAINTS, margin_figures
-from ..analysis.stability.differentiable import UNLIMITED_DELAY, UNLIMITED_GAIN
 from ..analysis.stability.operating_point import OperatingPoint
+from ..analysis.stability.sampled_margins import (
+    UNLIMITED_DELAY,
+    UNLIMITED_GAIN,
+)
 from ..analysis.step_response import NAMES, step_ends
 from ..core.arrays import as_array
 from ..core.rollout import in_blocks

@@ -7,8 +7,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..analysis.stability.differentiable import sensitivity_impulse
 from ..analysis.stability.operating_point import OperatingPoint
+from ..analysis.stability.small_motion import sensitivity_impulse
 from ..core.arrays import Scalar, as_array
 from ..core.feedback import Feedback
 from ..identification.residual_record import Part, ResidualRecord, Stretch

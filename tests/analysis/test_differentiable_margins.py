@@ -16,11 +16,11 @@ from piezojax.analysis.stability import (
     stability_report,
 )
 from piezojax.analysis.stability.conserved import LinearLoop
-from piezojax.analysis.stability.differentiable import (
+from piezojax.analysis.stability.margins import report_of
+from piezojax.analysis.stability.sampled_margins import (
     BANDS,
     UNLIMITED_DELAY,
     UNLIMITED_GAIN,
-    _axes_impulse,
     bandwidth_of,
     closed_loop_peak_of,
     delay_margin_of,
@@ -29,10 +29,12 @@ from piezojax.analysis.stability.differentiable import (
     peak_of,
     peaks_of,
     phase_margin_of,
+)
+from piezojax.analysis.stability.small_motion import (
+    _axes_impulse,
     references_followed,
     sensitivities,
 )
-from piezojax.analysis.stability.margins import report_of
 from piezojax.catalog import p558, p558_control, p753, p753_stage
 from piezojax.core.paths import replace
 from piezojax.dynamics import linearise

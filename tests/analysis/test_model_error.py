@@ -5,12 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from piezojax.analysis.stability.differentiable import UNLIMITED_DELAY
 from piezojax.analysis.stability.model_error import (
     NEAR_ONE,
     worst_delay_margin,
     worst_sensitivity,
 )
+from piezojax.analysis.stability.sampled_margins import UNLIMITED_DELAY
 from piezojax.core.error_bound import ErrorBound
 
 RANDOM = np.random.default_rng(3)

@@ -9,7 +9,8 @@ from oracles.loop import closed_loop
 from oracles.published import plant_t2, smc_gains
 
 import piezojax as pj
-from piezojax.analysis.stability.differentiable import peak_of, sensitivity
+from piezojax.analysis.stability.sampled_margins import peak_of
+from piezojax.analysis.stability.small_motion import sensitivity
 from piezojax.catalog import p753, p753_stage
 from piezojax.control.recursive_weights import RecursiveWeights
 from piezojax.core.feedback import LoopInput, Observation

@@ -52,7 +52,7 @@ MODULES = {
     ),
     "analysis/stability/crossings.py": _MARGINS,
     "analysis/stability/margins.py": _MARGINS,
-    "analysis/stability/differentiable.py": (
+    "analysis/stability/sampled_margins.py": (
         "tests/analysis/test_differentiable_margins.py",
     ),
     "analysis/stability/axes_margins.py": _AXES,

@@ -165,7 +165,7 @@ MUTATIONS = (
     # Stability and limit
     Mutation(
         "Ms on one branch",
-        "analysis/stability/differentiable.py",
+        "analysis/stability/small_motion.py",
         "jnp.asarray([*BRANCHES.values()])",
         "jnp.asarray([*BRANCHES.values()][:1] * 2)",
         ("tests/analysis/test_differentiable_margins.py", "-k", "every_branch"),
@@ -179,7 +179,7 @@ MUTATIONS = (
     ),
     Mutation(
         "delay margin of a response without crossings with phase lead",
-        "analysis/stability/differentiable.py",
+        "analysis/stability/sampled_margins.py",
         "smallest(jnp.where(crosses, lag",
         "smallest(jnp.where(crosses & (lag < jnp.pi), lag",
         ("tests/analysis/test_differentiable_margins.py", "-k", "lead"),

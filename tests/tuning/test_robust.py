@@ -19,7 +19,7 @@ from piezojax.analysis.constraints import (
     worst_excess,
 )
 from piezojax.analysis.stability import OperatingPoint, stability_report
-from piezojax.analysis.stability.differentiable import BANDS
+from piezojax.analysis.stability.sampled_margins import BANDS
 from piezojax.analysis.step_response import StepFigures
 from piezojax.catalog import p753, p753_stage
 from piezojax.core.metrics import ExtremeFigures, TrackingFigures

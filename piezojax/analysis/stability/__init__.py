@@ -17,11 +17,11 @@ from .axes_margins import axes_report_of as axes_report_of
 from .broken_loop import BrokenLoop as BrokenLoop
 from .broken_loop import broken_loop as broken_loop
 from .broken_loop import open_loop as open_loop
-from .differentiable import closed_loop_poles as closed_loop_poles
-from .differentiable import sensitivity as sensitivity
-from .differentiable import sensitivity_peak as sensitivity_peak
 from .margins import StabilityReport as StabilityReport
 from .margins import report_of as report_of
 from .model_error import worst_delay_margin as worst_delay_margin
 from .model_error import worst_sensitivity as worst_sensitivity
 from .operating_point import OperatingPoint as OperatingPoint
+from .sampled_margins import sensitivity_peak as sensitivity_peak
+from .small_motion import closed_loop_poles as closed_loop_poles
+from .small_motion import sensitivity as sensitivity

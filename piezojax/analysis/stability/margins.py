@@ -249,7 +249,7 @@ def sensitivity_figures(
     They are the largest singular values of S and T over frequency, with one axis |S|
     and |T|. They are sampled on ``grid`` (rad/sample, see ``angle_grid``) and refined
     by bounded minimisation between neighbours of the highest points. The result is
-    exact; ``differentiable.sensitivity_peak`` is the cheap approximation.
+    exact; ``sensitivity_peak`` is the cheap approximation.
     """
     figures: dict[str, float | None] = {}
     sampled = loop.closed_responses(grid)

@@ -9,7 +9,7 @@ Postlethwaite, Multivariable Feedback Control, 2nd ed., 7.5).
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
-from .differentiable import UNLIMITED_DELAY
+from .sampled_margins import UNLIMITED_DELAY
 
 NEAR_ONE = 0.99
 """``l |T|`` above which the worst sensitivity continues along its tangent."""
