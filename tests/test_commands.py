@@ -34,7 +34,7 @@ from piezojax.cli.terminal import Bar, console
 from piezojax.core.registry import parts
 from piezojax.identification.chain import DEFAULT
 from piezojax.identification.estimators.estimate import Options
-from piezojax.report.summary_tables import tuning_table
+from piezojax.report.tuning_tables import tuning_table
 from piezojax.reproduction import TABLES
 from piezojax.reproduction.cell import Cell
 from piezojax.reproduction.rates import FIGURE, RateError

@@ -12,7 +12,7 @@ import piezojax
 from piezojax.report.figures import figure, plain_tick_labels
 from piezojax.report.live_figures import LiveFigures
 from piezojax.report.page import PICTURES, Page, page_html, table_html
-from piezojax.report.summary_tables import reproduction_table
+from piezojax.report.reproduction_tables import reproduction_table
 from piezojax.reproduction.cell import Cell
 from piezojax.reproduction.rates import FIGURE
 from piezojax.reproduction.summary import summarise

@@ -208,8 +208,8 @@ def main(
         from ..identification.records.record import read_record
         from ..report.fit_page import fit_page
         from ..report.fit_pictures import write_fit
+        from ..report.fit_tables import models_table
         from ..report.page import write_page
-        from ..report.summary_tables import models_table
 
         if model == "help":
             console.print(models_table())
@@ -285,8 +285,8 @@ def main(
     def measure(console, loaded):
         from ..core.files import write_json
         from ..identification.device_scale import device_scale
+        from ..report.fit_tables import scale_table
         from ..report.page import Page, write_page
-        from ..report.summary_tables import scale_table
 
         if len(loaded) > 1:
             raise ValueError("--controller takes one RECORD")

@@ -44,7 +44,7 @@ def main(tables, calibrate, out, seed, quiet):
     # JAX and its users are imported here, so that --help does not wait for them.
     def body(console):
         from ..report.page import Page, write_page
-        from ..report.summary_tables import reproduction_table
+        from ..report.reproduction_tables import reproduction_table
         from ..report.table_pictures import write_picture, write_rates
         from ..reproduction import reproduce
         from ..reproduction.cell import title_of

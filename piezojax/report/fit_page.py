@@ -2,8 +2,8 @@
 
 from ..identification.fit import Fit
 from ..identification.held_dynamics import bound_text
+from .fit_tables import fit_table
 from .page import Page
-from .summary_tables import fit_table
 
 
 def fit_page(fit: Fit) -> Page:

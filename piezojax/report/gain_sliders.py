@@ -14,7 +14,7 @@ from ..tuning.gain_surrogate import Figures, GainSurrogate
 from ..tuning.near_gains import MARGINS, STEP
 from ..tuning.outcome import Outcome
 from .figures import AFTER, BEFORE
-from .summary_tables import short_names
+from .tuning_tables import short_names
 
 # Bokeh is imported where it draws: its import takes as long as all others together.
 if TYPE_CHECKING:

@@ -7,9 +7,9 @@ from rich.table import Table
 from ..identification.measured_response import Measurement
 from ..identification.response_levels import ResponseLevels
 from ..identification.response_model import ResponseModel
+from .fit_tables import parameter_table
 from .page import Page
 from .response_pictures import level_labels
-from .summary_tables import parameter_table
 
 
 def response_page(

@@ -15,7 +15,7 @@ from .page import Page
 from .robustness import constraints_table, front_table
 from .step_pictures import steps_table
 from .structure_pictures import structures_table
-from .summary_tables import (
+from .tuning_tables import (
     beside_table,
     following_table,
     gains_table,

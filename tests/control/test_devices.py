@@ -12,7 +12,7 @@ import piezojax as pj
 from piezojax.control import E727, NV200, PyRPL, Servo, Stabilizer
 from piezojax.core.serial import from_data, to_data
 from piezojax.core.system import Affine
-from piezojax.report.summary_tables import gains_table
+from piezojax.report.tuning_tables import gains_table
 from piezojax.study import Study, build
 from piezojax.tuning.device_alarms import device_alarms
 

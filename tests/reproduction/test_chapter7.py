@@ -11,7 +11,7 @@ from oracles import three_dof as oracle
 from rich.console import Console
 
 from piezojax.catalog import p558
-from piezojax.report.summary_tables import reproduction_table
+from piezojax.report.reproduction_tables import reproduction_table
 from piezojax.report.table_pictures import cells_figure
 from piezojax.reproduction import chapter7, summarise, three_dof
 

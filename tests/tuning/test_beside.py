@@ -13,7 +13,7 @@ from piezojax.analysis.stability import OperatingPoint, stability_report
 from piezojax.catalog import p753_survey
 from piezojax.core.feedback import Feedback, loop_inputs
 from piezojax.core.progress import Silent
-from piezojax.report.summary_tables import beside_table
+from piezojax.report.tuning_tables import beside_table
 from piezojax.solve.clock import Clock
 from piezojax.study import read
 from piezojax.tuning.beside import FiguresBeside

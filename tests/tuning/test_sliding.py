@@ -9,7 +9,7 @@ from piezojax import loop_inputs
 from piezojax.analysis.sliding_share import sliding_parts
 from piezojax.catalog import p753
 from piezojax.core.feedback import Feedback
-from piezojax.report.summary_tables import sliding_text
+from piezojax.report.tuning_tables import sliding_text
 from piezojax.study import build, load, shipped
 from piezojax.tuning import Result
 from piezojax.tuning.data import make_data
