@@ -22,7 +22,8 @@ from piezojax.identification.residual_record import (
 )
 from piezojax.report.fit_pictures import write_model
 from piezojax.study import Study, as_toml, build, sha256_of, study_schema
-from piezojax.study.schema import _FILES, AxesTable
+from piezojax.study.schema import AxesTable
+from piezojax.study.study_file import _FILES
 from piezojax.tuning.data import make_data
 from piezojax.tuning.make_result import _residual_notes
 from piezojax.tuning.response_margins import margins_on_response

@@ -15,7 +15,7 @@ from .tune import finish, sliders_option, tune_study
 
 if TYPE_CHECKING:
     from ..identification import Record
-    from ..study.first_study import Plan
+    from ..study.first_plan import Plan
     from ..tuning.outcome import Outcome
 
 STUDY, TUNED, EXPORTED = "study.toml", "tuned", "controller"
@@ -156,7 +156,11 @@ def _write_study(
     from ..identification import DEFAULT
     from ..identification.records.recognise import recognised
     from ..identification.records.record import read_record
-    from ..study.first_study import doubts, first_study, planned
+    from ..study.first_plan import (
+        doubts,
+        planned,
+    )
+    from ..study.first_study import first_study
 
     asked = {name: given[name] for name in QUESTIONS}
     columns = recognised(
@@ -192,7 +196,7 @@ def _asked(record: "Record", given: dict[str, Any]) -> "Plan":
     A question is repeated after an invalid answer. Raises ValueError, naming the
     option, if the input ends before all are answered.
     """
-    from ..study.first_study import planned
+    from ..study.first_plan import planned
 
     plan, answers = planned(record, given), dict(given)
     for name, question in QUESTIONS.items():
@@ -214,7 +218,7 @@ def _asked(record: "Record", given: dict[str, Any]) -> "Plan":
 
 def _concerns(name: str, plan: "Plan") -> bool:
     """Return whether a question matters for the controller of ``plan``."""
-    from ..study.first_study import DEVICES
+    from ..study.first_plan import DEVICES
 
     return name not in OF_DEVICES or plan.controller in DEVICES
 
@@ -270,7 +274,7 @@ def _export(
     Gains of a device are written in its file format, all others as C code.
     """
     from ..study import load
-    from ..study.first_study import DEVICES
+    from ..study.first_plan import DEVICES
     from ..tuning.exported_runs import make_runs
 
     device = load(folder / STUDY).controller.get("design") in DEVICES

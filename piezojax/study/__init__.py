@@ -15,9 +15,9 @@ from .ensemble import Ensemble as Ensemble
 from .ensemble import Stage as Stage
 from .json_schema import study_schema as study_schema
 from .schema import Study as Study
-from .schema import as_toml as as_toml
-from .schema import load as load
-from .schema import sha256_of as sha256_of
+from .study_file import as_toml as as_toml
+from .study_file import load as load
+from .study_file import sha256_of as sha256_of
 
 DEFAULT = "p753_learned_inverse"
 """Name of the default study."""

@@ -30,8 +30,9 @@ from .measured_noise import MeasuredNoise, read_noise
 from .origin import check_origin
 from .parameters import check_value, search_space
 from .references import reference_signals
-from .schema import Study, load
+from .schema import Study
 from .sources import about_file, source_error, system_of
+from .study_file import load
 from .trajectories import read_trajectories
 
 
