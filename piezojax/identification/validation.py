@@ -13,8 +13,8 @@ from pydantic import BaseModel
 from ..core.about import About
 from ..core.error_bound import ErrorBound
 from ..core.system import System, accepts, rest_output
-from .estimators.approach import start_of
 from .estimators.projection import excited_columns
+from .estimators.start_search import start_of
 from .fit import POOR, unexplained_share
 from .records.record import LARGEST, Record
 from .residuals.bound import joined

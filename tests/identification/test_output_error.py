@@ -11,9 +11,10 @@ from piezojax.core.paths import replace
 from piezojax.identification import free_run
 from piezojax.identification.chain import structure
 from piezojax.identification.estimators import output_error
-from piezojax.identification.estimators.approach import run_after, start_columns
+from piezojax.identification.estimators.approach import run_after
 from piezojax.identification.estimators.error_problem import at_starts, problem_of
 from piezojax.identification.estimators.free_runs import starts_of
+from piezojax.identification.estimators.linear_start import start_columns
 
 MODEL = "coleman_hodgdon+arma"
 

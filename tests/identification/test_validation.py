@@ -13,7 +13,7 @@ from piezojax.core.error_bound import ErrorBound
 from piezojax.dynamics import FirstOrderLag, StateSpace
 from piezojax.hysteresis import PrandtlIshlinskii
 from piezojax.identification import Record, free_run, validate
-from piezojax.identification.estimators.approach import start_of
+from piezojax.identification.estimators.start_search import start_of
 from piezojax.identification.validation import default_part
 
 DT, NOISE = 1e-4, 2e-3

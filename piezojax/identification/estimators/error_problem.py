@@ -12,8 +12,13 @@ from ...core.arrays import as_array
 from ...core.space import Space
 from ...core.system import System
 from ..records.record import Record
-from .approach import Start, most_likely, run_after, start_columns
+from .approach import run_after
 from .free_runs import from_rest
+from .linear_start import (
+    Start,
+    most_likely,
+    start_columns,
+)
 from .noise_model import NOISE_ORDER, whitening_filter
 from .structure import Structure
 

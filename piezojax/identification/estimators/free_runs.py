@@ -12,7 +12,8 @@ from ...core.rollout import simulate
 from ...core.system import System, at_rest, resolve
 from ...hysteresis.model import input_before
 from ..records.record import Record
-from .approach import Start, start_of
+from .linear_start import Start
+from .start_search import start_of
 
 
 def free_run(
