@@ -1,15 +1,18 @@
 """Common parts of all commands: options, the results folder, one-line errors."""
 
+import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 from rich.console import Console
+from rich.table import Table
 from rich.text import Text
 
 from ..core.files import fresh_folder, numbered_folder
+from ..core.profile import Profile, profiled
 from ..core.runtime import keep_programs
 from ..core.temporaries import claimed, is_claimed, remove_stale
 from .stopping import exit_interrupted, terminable
@@ -26,8 +29,13 @@ RESULTS = Path("results")
 
 
 def common(function: Callable) -> Callable:
-    """Add the options ``--out``, ``--seed`` and ``--quiet``."""
+    """Add the options ``--out``, ``--seed``, ``--quiet`` and ``--profile``."""
     for option in (
+        click.option(
+            "--profile",
+            is_flag=True,
+            help="Print where the time went: import, compiling, running, drawing.",
+        ),
         click.option("--quiet", is_flag=True, help="Print only alarms and errors."),
         click.option(
             "--seed",
@@ -48,7 +56,7 @@ def common(function: Callable) -> Callable:
 
 
 class Command(click.Command):
-    """A command with one-line usage errors."""
+    """A command with one-line usage errors and, on request, a profile of its time."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse the arguments. Raises ClickException, one line, for a usage error."""
@@ -56,6 +64,12 @@ class Command(click.Command):
             return super().parse_args(ctx, args)
         except click.UsageError as error:
             raise _one_line(error.format_message()) from None
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command; with ``--profile``, print the time of each stage."""
+        asked = ctx.params.pop("profile", False)
+        with profiled(_print_profile) if asked else nullcontext():
+            return super().invoke(ctx)
 
 
 @contextmanager
@@ -104,6 +118,22 @@ def run(quiet: bool, body: Callable[[Console], Any]) -> None:
     except KeyboardInterrupt:
         click.echo("interrupted; finished files are kept", err=True)
         exit_interrupted()
+
+
+def _print_profile(found: Profile) -> None:
+    """Print the time of each stage on standard error, even of a quiet command."""
+    table = Table(title="where the time went")
+    table.add_column("stage")
+    for heading in ("time, s", "share, %", "programs"):
+        table.add_column(heading, justify="right")
+    total = sum(found.seconds.values())
+    for name, seconds in found.seconds.items():
+        share = f"{100.0 * seconds / total:.1f}"
+        number = found.programs.get(name, "")
+        table.add_row(name, f"{seconds:.2f}", share, f"{number}")
+    table.add_section()
+    table.add_row("total", f"{total:.2f}", "100", "", style="bold")
+    console(False, sys.stderr).print(table)
 
 
 def print_loading(console: Console) -> None:

@@ -5,6 +5,7 @@ import sys
 import time
 from contextlib import ExitStack, suppress
 from types import FrameType
+from typing import TextIO
 
 from rich.console import Console
 from rich.progress import (
@@ -112,10 +113,11 @@ class Bar:
             self._noted = now
 
 
-def console(quiet: bool) -> Console:
-    """Return the console on which a command prints: standard output, or none."""
+def console(quiet: bool, file: TextIO | None = None) -> Console:
+    """Return the console of a command, on standard output or ``file``."""
     # Titles and paths may contain brackets, so nothing printed is markup.
-    found = Console(quiet=quiet, file=sys.stdout, highlight=False, markup=False)
+    file = file or sys.stdout
+    found = Console(quiet=quiet, file=file, highlight=False, markup=False)
     if not found.is_terminal and "COLUMNS" not in os.environ:
         found.width = PIPED
     return found

@@ -16,6 +16,7 @@ from typing import Any
 import jax
 
 from ..core.files import write_bytes
+from ..core.profile import COMPILING_C, stage
 from ..core.runtime import processor
 
 FLAGS = (
@@ -132,6 +133,7 @@ def _kept(name: str) -> ctypes.CDLL | None:
         return None
 
 
+@stage(COMPILING_C)
 def _compiled(name: str, text: str) -> ctypes.CDLL:
     level = "-O2" if text.count("\n") < QUICK else "-O1"
     include = f"-I{jax.ffi.include_dir()}"

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.about import About
+from ..core.profile import COMPILING_C, stage
 from ..core.system import System
 from ..scalar.memory import NotScalarError
 from .c_project import CProject
@@ -132,7 +133,8 @@ class CompiledLoop:
             (folder / file).write_text(text, encoding="utf-8")
         sources = [file for file in files if file.endswith(".c")]
         command = [self.compiler, *FLAGS, "-o", "loop.so", *sources, "-lm"]
-        done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+        with stage(COMPILING_C):
+            done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
         if done.returncode:
             raise ValueError(f"{self.compiler} fails: {done.stderr.strip()}")
         return ctypes.CDLL(str(folder / "loop.so"))

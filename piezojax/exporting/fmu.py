@@ -18,6 +18,7 @@ import numpy as np
 
 from ..core.about import About
 from ..core.files import fresh_folder, write_bytes
+from ..core.profile import COMPILING_C, stage
 from ..core.system import System
 from .c_project import CProject
 from .fmu_template import FMU
@@ -73,7 +74,8 @@ def write_fmu(
             (Path(scratch) / file).write_text(text, encoding="utf-8")
         binary = f"{name}.{extension}"
         command = [compiler, *FLAGS, "-o", binary, "fmu.c", f"{name}.c", "-lm"]
-        done = subprocess.run(command, cwd=scratch, capture_output=True, text=True)
+        with stage(COMPILING_C):
+            done = subprocess.run(command, cwd=scratch, capture_output=True, text=True)
         if done.returncode:
             raise ValueError(f"{compiler} fails: {done.stderr.strip()}")
         files = {

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..analysis.step_response import BAND
 from ..core.arrays import as_array
+from ..core.profile import DRAWING, stage
 from ..core.space import SCALES
 from ..tuning.gain_surrogate import Figures, GainSurrogate
 from ..tuning.near_gains import MARGINS, STEP
@@ -52,6 +53,7 @@ td:nth-child(2), td:nth-child(3) { text-align: right; }
 """
 
 
+@stage(DRAWING)
 def gain_sliders(
     surrogate: GainSurrogate | str | None, outcome: Outcome
 ) -> "UIElement | None":

@@ -17,6 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ..core.files import write_text
+from ..core.profile import DRAWING, stage
 from ..tuning.result import STUDY_FILE
 from .figures import Pictures
 from .live_figures import LiveFigures, live_figures
@@ -92,6 +93,7 @@ class Page:
     origin: Sequence[str] = ()
 
 
+@stage(DRAWING)
 def write_page(
     page: Page,
     folder: Path,
