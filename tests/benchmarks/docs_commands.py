@@ -109,12 +109,15 @@ SPECIAL = {
         tables={"optimiser": BRIEF, "ensemble": FEW},
         statuses=ALARMS,
     ),
-    "python -m piezojax.tune tuning/p753_robust.toml --out DIR": Special(
-        "shortened: 9 minutes on an idle core",
-        study="tuning/p753_robust.toml",
-        tables={"optimiser": BRIEF, "ensemble": FEW},
-        statuses=ALARMS,
-    ),
+    **{
+        f"python -m piezojax.tune tuning/p753_robust.toml {option}": Special(
+            "shortened: 9 minutes on an idle core",
+            study="tuning/p753_robust.toml",
+            tables={"optimiser": BRIEF, "ensemble": FEW},
+            statuses=ALARMS,
+        )
+        for option in ("--out DIR", "--profile")
+    },
     **{
         f"python -m piezojax.tune tuning/three_dof_{name}.toml": Special(
             "shortened: 8 minutes and more on an idle core",
