@@ -6,7 +6,6 @@ from ..analysis.constraints import uses
 from ..analysis.stability import StabilityReports, stability_reports
 from ..core.arrays import as_array
 from ..core.progress import Progress
-from ..solve.clock import Clock
 from ..solve.multi_start import Strategy, minimise
 from ..solve.problem import TOLERANCE
 from ..solve.search_state import SearchState
@@ -29,7 +28,6 @@ def search_within_limits(
     objective: Objective,
     case: Case,
     evaluator: Evaluator,
-    clock: Clock,
     progress: Progress,
     also: np.ndarray | None = None,
 ) -> Found:
@@ -50,10 +48,10 @@ def search_within_limits(
     if uses(own, "margins") or study.pareto or own == study.limits:
         carried = evaluator.worst_plants(case.loop)
         every = every.on_margin_stages(carried.stages)
-        search, strategy = search_box(every, case, clock, progress, also)
+        search, strategy = search_box(every, case, progress, also)
         return _repeated(every, case, evaluator, carried, search, strategy, progress)
     objective = objective.with_limits(own)
-    search, strategy = search_box(objective, case, clock, progress, also)
+    search, strategy = search_box(objective, case, progress, also)
     try:
         stability = exact_stability(case, search)
         after = case.space.put(case.loop, as_array(search.unit))
@@ -68,7 +66,7 @@ def search_within_limits(
         search.status = "interrupted"
         return objective, search, strategy, INTERRUPTED
     every = every.on_margin_stages(carried.stages)
-    again, strategy = search_box(every, case, clock, progress, search.unit[None])
+    again, strategy = search_box(every, case, progress, search.unit[None])
     again.evaluations += search.evaluations
     return _repeated(every, case, evaluator, carried, again, strategy, progress)
 

@@ -56,7 +56,6 @@ def make_strategy(objective: Objective, case: Case, clock: Clock) -> Strategy:
 def search_box(
     objective: Objective,
     case: Case,
-    clock: Clock,
     progress: Progress,
     also: np.ndarray | None = None,
 ) -> tuple[SearchState, Strategy | None]:
@@ -85,7 +84,6 @@ def search_box(
         minimise(strategy, objective, search.starts, search, table.steps, progress)
     except KeyboardInterrupt:
         search.status = "interrupted"
-    clock.compile_s += inner.compile_s
     return search, strategy
 
 

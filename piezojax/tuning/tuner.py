@@ -90,7 +90,7 @@ def _tuned(
         beside.begin(data, own)
     objective = make_objective(case, data, evaluator, before)
     objective, search, strategy, stability = search_within_limits(
-        objective, case, evaluator, clock, progress, also
+        objective, case, evaluator, progress, also
     )
 
     after = space.put(case.loop, as_array(search.unit))
