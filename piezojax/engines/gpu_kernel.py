@@ -30,6 +30,9 @@ REGISTERS = 100
 With more, the values that all lanes share are read from memory at each step. A thread
 has 255 registers of 32 bits on the GPUs of 2026."""
 
+MOST = 4000
+"""Largest number of operations of a step in the kernel."""
+
 
 class _Table(NamedTuple):
     """Values of nodes, one node per column of an array [lanes, nodes] or [1, nodes]."""
@@ -43,7 +46,9 @@ def computes(step: ScalarStep, by_lane: bool) -> bool:
 
     ``by_lane`` is true if inputs differ between lanes.
     """
-    return has_values(step) and not by_lane and not step.log and not step.slopes
+    if by_lane or step.log or step.slopes:
+        return False
+    return has_values(step) and len(step.steady) + len(step.moving) <= MOST
 
 
 def results(

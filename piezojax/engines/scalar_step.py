@@ -15,7 +15,7 @@ from ..scalar.trace import LONG, trace
 INDEX = jax.ShapeDtypeStruct((), jnp.int32)
 """Type of the number of a sample."""
 
-MOST = 4000
+MOST = 8000
 """Largest number of operations of a step; compilers take minutes for more."""
 
 
