@@ -11,9 +11,16 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 engines = importlib.import_module("engines")
 loop_three_dof = importlib.import_module("loop_three_dof")
-piezojax_engine = importlib.import_module("piezojax_engine")
+piezojax_engine = importlib.import_module("piezojax_engine")  # sets flags of XLA
+peers = importlib.import_module("peers")
 
 STEPS = 20_000  # one second
+PEERS = {
+    # A chunk of the benchmark would take a minute to compile.
+    "torch": lambda loop=engines.DOB_PID_SMC: peers.TorchEngine(loop, chunk=4),
+    "control": peers.ControlEngine,
+    "jaxonomy": peers.JaxonomyEngine,
+}
 
 
 def rms_of(engine, *problem):
@@ -37,6 +44,30 @@ def test_c_and_numpy_agree():
     problem = engines.problem(20, STEPS)
     c = rms_of(engines.c_engine, *problem)
     np.testing.assert_allclose(engines.numpy_engine(*problem), c, rtol=0, atol=1e-9)
+
+
+# One lane; lanes that python-control runs one after the other; more than one block of
+# jaxonomy. The steps do not fill the chunks of torch, and their number is odd.
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of torch within itself
+@pytest.mark.parametrize("lanes", [1, 3, 70])
+@pytest.mark.parametrize("name", PEERS)
+def test_peers_agree_with_numpy(name, lanes):
+    problem = engines.problem(lanes, 1001)
+    rms = rms_of(PEERS[name](), *problem)
+    assert rms.shape == (lanes,)
+    np.testing.assert_allclose(rms, engines.numpy_engine(*problem), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", PEERS)
+def test_peers_run_the_first_loop_only(name):
+    with pytest.raises(engines.UnavailableError, match=f"not written for {name}"):
+        PEERS[name](loop_three_dof.THREE_DOF_PID_SMC)
+
+
+def test_a_peer_that_is_not_installed_is_unavailable(monkeypatch):
+    monkeypatch.setitem(sys.modules, "jaxonomy", None)
+    with pytest.raises(engines.UnavailableError, match="jaxonomy cannot be imported"):
+        peers.JaxonomyEngine()(*engines.problem(1, 10))
 
 
 # one lane, and several blocks with the last one half filled

@@ -1,4 +1,4 @@
-"""Throughput of piezojax, C, numba and NumPy on closed loops.
+"""Throughput of piezojax, C, numba, NumPy and the peers of peers.py on closed loops.
 
     python tests/benchmarks/throughput.py --json throughput.json
 
@@ -13,8 +13,10 @@ load affects all equally. Rows of the JSON file:
     extra_memory_mb   growth of resident memory during a run (10^6 bytes), inputs and
                       compiled code not counted; null where the system is not Linux
 
-Compile times are separate, in `compile_s`. C is always timed.
-Every lane has its own reference and noise: 4096 lanes need about 6 GB of memory.
+Compile times are separate, in `compile_s`. C is always timed. Engines that are not
+installed are skipped; peers.py says how to install its own.
+Every lane has its own reference and noise: 4096 lanes need about 6 GB of memory, and
+with all peers 11 GB.
 """
 
 import argparse
@@ -43,7 +45,8 @@ from rich.console import Console  # noqa: E402
 from rich.table import Table  # noqa: E402
 
 LOOPS = {loop.name: loop for loop in (engines.DOB_PID_SMC, THREE_DOF_PID_SMC)}
-ENGINES = ("piezojax", "c", "numba", "numpy")
+ENGINES = ("piezojax", "c", "numba", "numpy", "torch", "control", "jaxonomy")
+COMPILED_PER_SHAPE = ("piezojax", "torch", "jaxonomy")
 SHORTEST_SAMPLE_S = 0.02  # shorter runs are repeated within one measurement
 SLOW_BUDGET_S = 1.0  # about the longest run of an engine marked slow
 TRIAL_STEPS = 200
@@ -106,6 +109,14 @@ def make_engine(name, what, loop):
         from piezojax_engine import PiezojaxEngine
 
         return PiezojaxEngine(what, loop)
+    if name in ("torch", "control", "jaxonomy"):
+        import peers
+
+        return {
+            "torch": peers.TorchEngine,
+            "control": peers.ControlEngine,
+            "jaxonomy": peers.JaxonomyEngine,
+        }[name](loop)
     return {
         "c": engines.CEngine,
         "numba": engines.NumbaEngine,
@@ -205,7 +216,8 @@ def in_fresh_process(function, *arguments):
 
 def versions():
     found = {"python": platform.python_version(), "machine": platform.machine()}
-    for name in ("piezojax", "jax", "jaxlib", "numba", "numpy"):
+    packages = ("piezojax", "jax", "jaxlib", "numba", "numpy")
+    for name in (*packages, "torch", "control", "jaxonomy"):
         try:
             found[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
@@ -226,6 +238,7 @@ def table(rows):
         shown.add_column(column, justify="right")
 
     def number(value, digits):
+        digits = 0 if value is not None and value >= 1000 else digits
         return "-" if value is None else f"{value:.{digits}f}"
 
     for row in rows:
@@ -243,15 +256,17 @@ def table(rows):
 
 
 def compile_key(row):
-    """Return the key of a compilation: C and numba compile once, piezojax per shape."""
-    if row["engine"] == "piezojax":
-        return f"piezojax {row['loop']} {row['what']} {row['lanes']}"
+    """Return the key of a compilation: per shape, or once (C and numba)."""
+    if row["engine"] in COMPILED_PER_SHAPE:
+        return f"{row['engine']} {row['loop']} {row['what']} {row['lanes']}"
     return f"{row['engine']} {row['loop']}"
 
 
 def main(arguments=None):
     options = parse(arguments)
     threads = pin_to_one_core()
+    if "piezojax" in options.engines:
+        import piezojax  # noqa: F401  # sets flags of XLA before jaxonomy starts it
     console = Console()
     skipped = set()
 
