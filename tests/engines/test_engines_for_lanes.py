@@ -457,6 +457,16 @@ def test_other_steps_run_in_the_loop(system, engine):
     np.testing.assert_array_equal(program(values, engine), program(values, "loop"))
 
 
+def test_a_long_step_runs_in_no_kernel_of_a_gpu(monkeypatch):
+    simulated = lanes_of(FirstOrderLag(1e-3, 1e-4), "time_constant", driven(), Means())
+    values = spread(3, 1e-3)
+    kernel_of(lambda v: simulated(v, "gpu"), values)
+    monkeypatch.setattr(gpu_kernel, "MOST", 3)
+    with pytest.raises(ValueError, match="not enough values to unpack"):
+        kernel_of(lambda v: simulated(v, "gpu"), values)
+    assert_engine_equals_loop("interpreted", simulated, values)
+
+
 @pytest.mark.skipif(
     jax.__version_info__ >= (0, 12),
     reason="this version of JAX lowers for a GPU only where there is one",
