@@ -67,8 +67,11 @@ LOOPS = {DOB_PID_SMC.name: lambda: loop, THREE_DOF_PID_SMC.name: three_dof_loops
 """Functions that make loop_of(gains), by the name of the loop."""
 
 
-def rms(loop_of, gains, inputs):
-    """Return the RMS errors of one lane over the second half of the run, by axis."""
+def rms(loop_of, gains, inputs, holding=None):
+    """Return the RMS errors of one lane over the second half of the run, by axis.
+
+    ``holding`` is the input that holds the plant at rest, if it is known.
+    """
     system = loop_of(gains)
     samples = jax.tree.leaves(inputs)[0].shape[0]
     metric = Tracking(start=samples // 2)
@@ -77,7 +80,7 @@ def rms(loop_of, gains, inputs):
         metric = PerAxisMetric(metric, len(inputs.noise))
         start = (0.0,) * len(inputs.noise)
     metric = Chosen(metric, ("rms_error",))
-    return metered(system, inputs, system.init(start), metric)[0]["rms_error"]
+    return metered(system, inputs, system.init(start, holding), metric)[0]["rms_error"]
 
 
 def block_of_rms(loop_of, gains, inputs):
@@ -85,16 +88,17 @@ def block_of_rms(loop_of, gains, inputs):
     return jax.vmap(lambda g, u: rms(loop_of, g, u), in_axes=(0, 1))(gains, inputs)
 
 
-def mean_square(loop_of, gains, inputs):
+def mean_square(loop_of, gains, inputs, holding=None):
     """Return the loss for gains [n] of all lanes and inputs [steps, lanes]."""
-    lanes = jax.vmap(lambda u: rms(loop_of, gains, u), in_axes=1)(inputs)
+    lanes = jax.vmap(lambda u: rms(loop_of, gains, u, holding), in_axes=1)(inputs)
     return jnp.mean(lanes**2)
 
 
-def value_and_gradient(loop_of, gains, inputs):
+def value_and_gradient(loop_of, gains, inputs, holding=None):
     """Return the loss and its gradient [n], in reverse mode as in a search."""
     with reverse_mode(True):
-        return jax.value_and_grad(lambda g: mean_square(loop_of, g, inputs))(gains)
+        loss = lambda g: mean_square(loop_of, g, inputs, holding)  # noqa: E731
+        return jax.value_and_grad(loss)(gains)
 
 
 def signals(reference, noise):

@@ -50,6 +50,9 @@ COMPILED_PER_SHAPE = ("piezojax", "torch", "jaxonomy")
 SHORTEST_SAMPLE_S = 0.02  # shorter runs are repeated within one measurement
 SLOW_BUDGET_S = 1.0  # about the longest run of an engine marked slow
 TRIAL_STEPS = 200
+SETTLED_S = 0.1
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # malloc.h
+KEPT_BY_HEAP = {M_TRIM_THRESHOLD: 0, M_MMAP_THRESHOLD: 16384}  # bytes
 
 
 def positive_int(text):
@@ -186,25 +189,39 @@ def memory_bytes(field):
 
 
 def extra_memory_mb(loop_name, what, name, lanes, steps):
-    """Return the peak growth of resident memory in one run of a new process.
-
-    ru_maxrss does not serve: a child inherits the peak of its parent, and compiling
-    raises it above that of the run. Instead the peak of the kernel is reset after a
-    warm-up run, when freed memory, which a run would reuse, has been returned.
-    """
+    """Return the extra memory of one run of an engine."""
     loop = LOOPS[loop_name]
     engine = make_engine(name, what, loop)
     engine.prepare(*part(loop.problem(lanes, steps), what, steps))
-    engine.run()
-    gc.collect()
+    return growth_of_memory_mb(engine.run)
+
+
+def growth_of_memory_mb(run):
+    """Return the peak growth of resident memory in one run of this new process.
+
+    ru_maxrss does not serve: a child inherits the peak of its parent, and compiling
+    raises it above that of the run. Instead the peak of the kernel is reset after a
+    warm-up run, when freed memory, which a run would reuse, has been returned. The heap
+    may keep some of it all the same, so the largest of several growths counts.
+    """
     try:
-        ctypes.CDLL(None).malloc_trim(0)
-        Path("/proc/self/clear_refs").write_text("5")
-        before = memory_bytes("VmRSS")
-        engine.run()
-        return max(0, memory_bytes("VmHWM") - before) / 1e6
+        library = ctypes.CDLL(None)
+        for limit, size in KEPT_BY_HEAP.items():
+            library.mallopt(limit, size)
+        return max(_growth(run, library) for _ in range(3)) / 1e6
     except (OSError, AttributeError, TypeError):
         return None
+
+
+def _growth(run, library):
+    run()
+    gc.collect()
+    time.sleep(SETTLED_S)  # other threads free memory shortly after the run
+    library.malloc_trim(0)
+    Path("/proc/self/clear_refs").write_text("5")
+    before = memory_bytes("VmRSS")
+    run()
+    return max(0, memory_bytes("VmHWM") - before)
 
 
 def in_fresh_process(function, *arguments):
