@@ -39,6 +39,10 @@ class Case(NamedTuple):
     options: tuple[str, ...]
 
 
+COLUMNS = (
+    *("--time", "time_s", "--input", "input_V"),
+    *("--output", "displacement_um"),
+)
 CASES = {"all models": Case(1, ("--model", "all")), "default": Case(MILLION, ())}
 
 
@@ -77,12 +81,14 @@ def line_of(case, stop):
         header = "time_s,input_V,displacement_um"
         np.savetxt(record, columns, "%.9g", ",", header=header, comments="")
         command = [sys.executable, "-m", "piezojax.identify", str(record)]
-        command += [*case.options, "--out", str(out)]
+        command += [*COLUMNS, *case.options, "--out", str(out)]
         seconds, memory, status = timed(command, stop)
         line = {"samples": len(columns), "stopped": status if stop else None}
         if stop:
             more, memory, status = timed(command)
             seconds += more
+        if status not in (0, 3):  # with an alarm
+            raise SystemExit(f"identify ended with status {status}")
         line |= {"seconds": seconds, "memory_GB": memory, "status": status}
         if (fit := out / "fit.json").is_file():
             report = json.loads(fit.read_text("utf-8"))
