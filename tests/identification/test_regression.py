@@ -27,6 +27,7 @@ from piezojax.identification import (
     recursive_least_squares,
     rows,
 )
+from piezojax.identification.estimators.regression import _Problem, _search
 
 C = p753.HYSTERESIS_CHAPTER_5["c"]
 POLES = np.sort(p753.plant().parts[1].poles())
@@ -313,3 +314,15 @@ def test_a_constant_input_is_refused(short):
 def test_bad_recursive_estimators(options, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         RecursiveLeastSquares(**{"c": C} | options)
+
+
+def test_runs_that_overflow_are_refused_without_a_warning():
+    class Diverging(_Problem):
+        def __init__(self):
+            pass
+
+        def error(self, c, theta):
+            return np.full(3, 1e200)
+
+    with pytest.raises(ValueError, match="no c in its bounds led to a finite"):
+        _search(Diverging(), lambda c, near=None: np.zeros(1), (-2.0, -1.0))

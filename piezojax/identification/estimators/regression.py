@@ -288,7 +288,8 @@ def _search(
         )
 
     def loss(c: float, theta: np.ndarray) -> float:
-        mean_square = float(np.mean(problem.error(c, theta) ** 2))
+        with np.errstate(over="ignore"):  # of a run that diverges
+            mean_square = float(np.mean(problem.error(c, theta) ** 2))
         # The search computes with the loss, so it must be finite.
         return mean_square if mean_square < FAILED_LOSS else FAILED_LOSS
 
