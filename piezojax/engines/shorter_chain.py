@@ -76,7 +76,10 @@ class Chain:
         self._order = list(step.moving)
         """The nodes in the order of computation. Those that ``step`` lacks are parts
         of sums."""
-        self._sums = {n: terms for n in self._order if (terms := self._terms(n))}
+        self._sums = {
+            n: self._merged(terms) for n in self._order if (terms := self._terms(n))
+        }
+        """The terms of each sum, one for each node."""
         self._changed: set[int] = set()
         self.times: dict[int, float] = {}
         self.states = {each.place: 0.0 for each in step.carried}
@@ -191,7 +194,7 @@ class Chain:
         if number not in self._sums or late not in self._sums:
             return False
         terms: list[Term] = []
-        rests: dict[int, tuple[int, list[Term]]] = {}
+        rests: dict[int, tuple[int, list[Term], list[Term]]] = {}
         for outer in self._sums[number]:
             parts = self._sums.get(outer.node)
             if parts is None or self._known(outer.node) < self._known(late):
@@ -201,17 +204,16 @@ class Chain:
                 # Later operations share the sum of all terms but the last.
                 *early, last = self._sorted(parts)
                 rest = max(len(self.nodes), *self._order, *rests) + 1
-                rests[rest] = outer.node, early
                 self.times[rest] = self._sum_time(early)[0]
                 parts = [Term(1, None, rest), last]
+                rests[rest] = outer.node, early, parts
             terms += [self._product(outer, part) for part in parts]
         terms = self._merged(terms)
         if self._sum_time(terms)[0] >= self.times[number]:
             return False
-        for rest, (whole, early) in rests.items():
-            last = self._sorted(self._sums[whole])[-1]
+        for rest, (whole, early, parts) in rests.items():
             self._order.insert(self._order.index(whole), rest)
-            self._sums |= {rest: early, whole: [Term(1, None, rest), last]}
+            self._sums |= {rest: early, whole: parts}
             self._changed |= {rest, whole}
         self._sums[number] = terms
         self._changed.add(number)

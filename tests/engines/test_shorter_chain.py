@@ -96,6 +96,16 @@ def test_results_are_equal(program, system, carry, row):
         assert value == expected[place.leaf]
 
 
+def test_a_sum_that_is_added_to_itself():
+    def function(system, carry, row):
+        total = (carry[0] - row[0]) + system[0]
+        return [total + total]
+
+    given = {"system": [4.0, 1.0], "carry": [3.0], "row": [2.0]}
+    found = evaluated(shortened(scalar(function, states=1)), given)
+    assert [*found.values()] == [10.0]
+
+
 def test_a_chain_of_sums_becomes_one():
     def function(system, carry, row):
         error = carry[0] - row[0]
