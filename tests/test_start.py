@@ -17,11 +17,7 @@ from piezojax.identification import Record, read_record
 from piezojax.identification.records.recognise import noise_rms, recognised
 from piezojax.signals import signal, time_grid
 from piezojax.study import build, load, sha256_of
-from piezojax.study.first_plan import (
-    Plan,
-    doubts,
-    planned,
-)
+from piezojax.study.first_plan import Plan, doubts, planned
 from piezojax.study.first_study import first_study
 from piezojax.tuning.result import Result, Scores
 

@@ -24,11 +24,7 @@ from .stability.sampled_margins import (
     peaks_of,
     phase_margin_of,
 )
-from .stability.small_motion import (
-    Sensitivity,
-    references_followed,
-    sensitivities,
-)
+from .stability.small_motion import Sensitivity, references_followed, sensitivities
 from .step_response import NAMES as STEPS
 from .step_response import StepFigures
 

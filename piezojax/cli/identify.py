@@ -5,12 +5,7 @@ from pathlib import Path
 import click
 
 from .command import Command, common, print_loading, print_results, results_folder, run
-from .identify_response import (
-    Amplitudes,
-    ResponseOptions,
-    fit_responses,
-    load_dynamics,
-)
+from .identify_response import Amplitudes, ResponseOptions, fit_responses, load_dynamics
 from .records import SampleRange, print_columns, record_columns
 from .stopping import exit_interrupted
 from .terminal import Bar

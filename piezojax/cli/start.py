@@ -156,10 +156,7 @@ def _write_study(
     from ..identification import DEFAULT
     from ..identification.records.recognise import recognised
     from ..identification.records.record import read_record
-    from ..study.first_plan import (
-        doubts,
-        planned,
-    )
+    from ..study.first_plan import doubts, planned
     from ..study.first_study import first_study
 
     asked = {name: given[name] for name in QUESTIONS}

@@ -10,11 +10,7 @@ from jaxtyping import Complex, Float
 from pydantic import BaseModel
 
 from ..analysis.stability.operating_point import OperatingPoint
-from ..analysis.stability.small_motion import (
-    lines,
-    references_followed,
-    sensitivities,
-)
+from ..analysis.stability.small_motion import lines, references_followed, sensitivities
 from ..core.error_bound import ErrorBound
 from ..core.feedback import Feedback
 from ..core.files import write_report, write_text

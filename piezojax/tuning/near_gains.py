@@ -12,10 +12,7 @@ import scipy.stats.qmc
 
 from ..analysis.constraints import CONSTRAINTS, margin_figures
 from ..analysis.stability.operating_point import OperatingPoint
-from ..analysis.stability.sampled_margins import (
-    UNLIMITED_DELAY,
-    UNLIMITED_GAIN,
-)
+from ..analysis.stability.sampled_margins import UNLIMITED_DELAY, UNLIMITED_GAIN
 from ..analysis.step_response import NAMES, step_ends
 from ..core.arrays import as_array
 from ..core.rollout import in_blocks

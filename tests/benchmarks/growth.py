@@ -44,14 +44,7 @@ from rich.console import Console
 from rich.table import Table
 
 from piezojax.core.feedback import holding_input
-from piezojax.report.figures import (
-    AFTER,
-    BEFORE,
-    REFERENCE,
-    figure,
-    plot_style,
-    write,
-)
+from piezojax.report.figures import AFTER, BEFORE, REFERENCE, figure, plot_style, write
 
 REPEATS = 5
 FEWEST = 3

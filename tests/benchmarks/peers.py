@@ -370,3 +370,7 @@ class JaxonomyEngine(Engine):
     def run(self):
         results = [self._compiled(context) for context in self._contexts]
         return np.concatenate([np.atleast_1d(r) for r in results])[: self._lanes]
+
+
+ENGINES = {each.name: each for each in (TorchEngine, ControlEngine, JaxonomyEngine)}
+"""Engines by the name of their package."""

@@ -40,12 +40,17 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 import engines  # noqa: E402
+import peers  # noqa: E402
 from loop_three_dof import THREE_DOF_PID_SMC  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.table import Table  # noqa: E402
 
 LOOPS = {loop.name: loop for loop in (engines.DOB_PID_SMC, THREE_DOF_PID_SMC)}
-ENGINES = ("piezojax", "c", "numba", "numpy", "torch", "control", "jaxonomy")
+WRITTEN = {
+    each.name: each
+    for each in (engines.CEngine, engines.NumbaEngine, engines.NumpyEngine)
+} | peers.ENGINES
+ENGINES = ("piezojax", *WRITTEN)
 COMPILED_PER_SHAPE = ("piezojax", "torch", "jaxonomy")
 SHORTEST_SAMPLE_S = 0.02  # shorter runs are repeated within one measurement
 SLOW_BUDGET_S = 1.0  # about the longest run of an engine marked slow
@@ -112,19 +117,7 @@ def make_engine(name, what, loop):
         from piezojax_engine import PiezojaxEngine
 
         return PiezojaxEngine(what, loop)
-    if name in ("torch", "control", "jaxonomy"):
-        import peers
-
-        return {
-            "torch": peers.TorchEngine,
-            "control": peers.ControlEngine,
-            "jaxonomy": peers.JaxonomyEngine,
-        }[name](loop)
-    return {
-        "c": engines.CEngine,
-        "numba": engines.NumbaEngine,
-        "numpy": engines.NumpyEngine,
-    }[name](loop)
+    return WRITTEN[name](loop)
 
 
 def part(data, what, steps):
@@ -234,7 +227,7 @@ def in_fresh_process(function, *arguments):
 def versions():
     found = {"python": platform.python_version(), "machine": platform.machine()}
     packages = ("piezojax", "jax", "jaxlib", "numba", "numpy")
-    for name in (*packages, "torch", "control", "jaxonomy"):
+    for name in (*packages, *peers.ENGINES):
         try:
             found[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:

@@ -8,15 +8,9 @@ import numpy as np
 import pytest
 from oracles import regression
 
-from piezojax import (
-    Record,
-    load,
-    save,
-)
+from piezojax import Record, load, save
 from piezojax.catalog import p753
-from piezojax.hysteresis import (
-    HystereticARMA,
-)
+from piezojax.hysteresis import HystereticARMA
 from piezojax.identification import (
     Measured,
     Orders,

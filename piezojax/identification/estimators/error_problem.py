@@ -14,11 +14,7 @@ from ...core.system import System
 from ..records.record import Record
 from .approach import run_after
 from .free_runs import from_rest
-from .linear_start import (
-    Start,
-    most_likely,
-    start_columns,
-)
+from .linear_start import Start, most_likely, start_columns
 from .noise_model import NOISE_ORDER, whitening_filter
 from .structure import Structure
 
