@@ -203,4 +203,4 @@ def test_bad_options_are_refused_in_one_line(tmp_path):
     assert printed.exit_code == 1
     assert printed.output.splitlines()[-1].startswith("Error: highest is 900 Hz; it")
     assert not (tmp_path / "out").exists()
-    assert "Missing option '--rate'" in call(tmp_path / "out").output
+    assert "--rate is missing; without RESULTS" in call(tmp_path / "out").output

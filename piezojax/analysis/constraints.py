@@ -97,6 +97,11 @@ class Constraint(NamedTuple):
         """Return the values [plants], or with further axes, in ``unit``."""
         return self.values(getattr(loop, self.source), loop.dt)
 
+    def worst(self, values: Array, axis: int | None = None) -> Array:
+        """Return the largest of ``values`` for an upper limit, else the smallest."""
+        pick = {"at most": jnp.max, "at least": jnp.min}[self.sense]
+        return pick(values, axis=axis)
+
 
 def _largest(runs: Array) -> Array:
     """Return the largest value [plants] of ``runs`` [plants, references, draws]."""
@@ -391,14 +396,10 @@ def worst_excess(
 
 
 def worst_by_plant(limits: Iterable[str], loop: LoopFigures) -> dict[str, Array]:
-    """Return the worst value [plants] of each constrained figure.
-
-    The worst value is the largest for an upper limit and the smallest for a lower one.
-    """
-    pick = {"at most": jnp.max, "at least": jnp.min}
+    """Return the worst value [plants] of each constrained figure."""
     found = {}
     for name in limits:
         values = CONSTRAINTS[name].read(loop)
         values = values.reshape(values.shape[0], -1)
-        found[name] = pick[CONSTRAINTS[name].sense](values, axis=1)
+        found[name] = CONSTRAINTS[name].worst(values, axis=1)
     return found

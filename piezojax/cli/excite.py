@@ -1,17 +1,31 @@
-"""``python -m piezojax.excite --lower V --upper V --rate HZ``: voltages to record."""
+"""``python -m piezojax.excite [RESULTS]``: voltages to record."""
+
+from pathlib import Path
 
 import click
 
-from .command import Command, common, print_results, results_folder, run
+from .command import (
+    Command,
+    common,
+    print_loading,
+    print_results,
+    results_folder,
+    run,
+)
+from .terminal import Bar
 
-RECORD = "record.csv"
-"""File name of the voltages of all parts, one after another."""
+RECORD, DESIGNED = "record.csv", "designed.csv"
+"""File names of a whole record, and of a designed one for a small buffer."""
+
+NEEDED = "lower", "upper", "rate"
+"""Options that RESULTS replace."""
 
 
 @click.command(cls=Command)
-@click.option("--lower", type=float, required=True, help="Lower limit, V.")
-@click.option("--upper", type=float, required=True, help="Upper limit, V.")
-@click.option("--rate", type=float, required=True, help="Rate of the generator, Hz.")
+@click.argument("results", required=False, type=click.Path(path_type=Path))
+@click.option("--lower", type=float, help="Lower limit, V.")
+@click.option("--upper", type=float, help="Upper limit, V.")
+@click.option("--rate", type=float, help="Rate of the generator, Hz.")
 @click.option("--slew", type=float, help="Largest slew rate of the amplifier, V/s.")
 @click.option(
     "--slowest",
@@ -23,7 +37,8 @@ RECORD = "record.csv"
 @click.option(
     "--highest",
     type=float,
-    help="Highest frequency of the multisine, Hz (default: 0.4 of the rate).",
+    help="Highest frequency of the multisine, and of the moves of a designed record, "
+    "Hz (default: 0.4 of the rate).",
 )
 @click.option(
     "--hold",
@@ -33,13 +48,20 @@ RECORD = "record.csv"
     help="Time for which a level is held, s; slower creep stays unknown.",
 )
 @click.option(
+    "--duration",
+    type=click.FloatRange(min=0.0, min_open=True),
+    default=1.0,
+    show_default=True,
+    help="Duration of each half of a designed record, s.",
+)
+@click.option(
     "--points",
     type=click.IntRange(min=1),
     help="Size of the generator's buffer: write a file for each part, with at most "
     "this number of points, instead of one record.",
 )
 @common
-def main(points, out, seed, quiet, **limits):
+def main(results, duration, points, out, seed, quiet, **limits):
     """Write voltages that excite the hysteresis, creep and dynamics of a stage.
 
     Apply them to the stage, and record voltage and displacement. The file record.csv
@@ -47,31 +69,90 @@ def main(points, out, seed, quiet, **limits):
     record and validates on the second. --points writes each part once, to its own file,
     at a lower rate or with a shorter multisine if needed; an NV200 has 1024 points at a
     --rate of 20000. Record each part, and give all records to identify together.
+
+    With RESULTS, a folder of tune with a fitted plant, the voltages are designed for
+    this plant and these gains: they make the errors of the promised figures small that
+    the errors of the plant cause. Limits and rate are those of its study by default.
     """
 
     def body(console):
-        from ..core.files import write_text
-        from ..report.excitation_pictures import excitation_page, write_excitation
-        from ..report.page import write_page
-        from ..signals.excitation import Generator, Part, buffered, excitation
-
         known = {name: value for name, value in limits.items() if value is not None}
-        generator = Generator(**known)
-        if points is None:
-            parts, whole = excitation(generator, seed or 0)
-            files = {RECORD: Part("record", whole, generator.rate, "")}
-        else:
-            parts = buffered(generator, points, seed or 0)
-            files = {f"{part.name}.csv": part for part in parts}
-        with results_folder(out, "excitation") as folder:
-            for name, part in files.items():
-                write_text(folder / name, csv_of(part))
-            pictures = write_excitation(parts, folder)
-            page = excitation_page(parts, files)
-            write_page(page, folder, pictures)
-        print_results(page, folder, console)
+        if results is not None:
+            _write_designed(results, known, duration, points, out, seed, console)
+            return
+        if missing := [f"--{name}" for name in NEEDED if name not in known]:
+            raise ValueError(
+                f"{missing[0]} is missing; without RESULTS, give "
+                + ", ".join(f"--{name}" for name in NEEDED)
+            )
+        _write_usual(known, points, out, seed, console)
 
     run(quiet, body)
+
+
+def _write_usual(limits, points, out, seed, console):
+    """Write the voltages for a stage that is not known yet."""
+    from ..core.files import write_text
+    from ..report.excitation_pictures import excitation_page, write_excitation
+    from ..report.page import write_page
+    from ..signals.excitation import Generator, Part, buffered, excitation
+
+    generator = Generator(**limits)
+    if points is None:
+        parts, whole = excitation(generator, seed or 0)
+        files = {RECORD: Part("record", whole, generator.rate, "")}
+    else:
+        parts = buffered(generator, points, seed or 0)
+        files = {f"{part.name}.csv": part for part in parts}
+    with results_folder(out, "excitation") as folder:
+        for name, part in files.items():
+            write_text(folder / name, csv_of(part))
+        pictures = write_excitation(parts, folder)
+        page = excitation_page(parts, files)
+        write_page(page, folder, pictures)
+    print_results(page, folder, console)
+
+
+def _write_designed(results, limits, duration, points, out, seed, console):
+    """Write the voltages designed for the gains and the plant in ``results``."""
+    print_loading(console)
+    from ..core.files import write_text
+    from ..report.excitation_pictures import next_record_page, write_excitation
+    from ..report.page import write_page
+    from ..signals.excitation import Generator, Part, after_rest
+    from ..tuning.next_record import EXPECTED_FILE, next_record
+    from ..tuning.result import load_loop
+
+    with Bar(console) as bar, results_folder(out, "excitation") as folder:
+        bar.stage("reading the results")
+        # A loop with an alarm may need a better record most.
+        case, loop = load_loop(results, accept_unsafe=True)
+        bounds = case.study.actuator
+        of_study = {
+            "lower": bounds.lower,
+            "upper": bounds.upper,
+            "rate": case.study.rate,
+        }
+        generator = Generator(**(of_study | limits))
+        samples = points or round(duration * generator.rate)
+        found = next_record(
+            case, loop, generator, samples, seed=seed or 0, progress=bar
+        )
+        bar.stage("drawing")
+        tells = "the promised figures of the gains"
+        part = Part("designed", found.fit, generator.rate, tells)
+        if points is None:
+            whole = after_rest(generator, (found.fit, found.validate))
+            files = {RECORD: Part("record", whole, generator.rate, "")}
+        else:
+            files = {DESIGNED: part}
+        for name, each in files.items():
+            write_text(folder / name, csv_of(each))
+        write_text(folder / EXPECTED_FILE, found.report.model_dump_json(indent=2))
+        pictures = write_excitation([part], folder)
+        page = next_record_page(found.report, part, files)
+        write_page(page, folder, pictures)
+    print_results(page, folder, console)
 
 
 def csv_of(part) -> str:

@@ -61,17 +61,12 @@ def learning_law(results: Path, named: Path | None) -> "LearningFilter":
     ``named`` is the file of its study, by default the one in the folder. Raises
     ValueError as ``study.read`` and ``load`` do.
     """
-    from dataclasses import replace
-
     import numpy as np
 
-    from ..core.serial import load
     from ..stages.learning import learning_filter
-    from ..study import read
-    from ..tuning.result import GAINS_FILE, STUDY_FILE
+    from ..tuning.result import load_loop
 
-    case = read(named or results / STUDY_FILE)
-    loop = replace(case.loop, controller=load(results / GAINS_FILE))
+    case, loop = load_loop(results, named)
     bound = case.plant_about.error_bound
     highest = float(np.max(case.highest_reference))
     return learning_filter(loop, highest, case.study.dt, bound)

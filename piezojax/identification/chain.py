@@ -59,6 +59,14 @@ def chain(name: str) -> list[str]:
     return [*parts, "lag"] if lagged else parts
 
 
+def is_own(path: str) -> bool:
+    """Return whether each record has its own value of the parameter at ``path``.
+
+    These are the state of a hysteresis before the record and the zero of the sensor.
+    """
+    return path == OFFSET or path.endswith("rest_input")
+
+
 def is_dynamic(part: str) -> bool:
     """Return whether a part is a hysteresis that contains dynamics."""
     kind = known_parts()[part]

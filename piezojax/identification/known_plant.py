@@ -18,7 +18,7 @@ from ..core.registry import parts as known_parts
 from ..core.space import Range, space_of
 from ..core.system import Affine, Series, System
 from ..dynamics import FractionalDelay
-from .chain import LINEAR, OFFSET, by_evidence, dynamics_of, point_of
+from .chain import LINEAR, by_evidence, dynamics_of, is_own, point_of
 from .estimators.structure import Prior, Structure
 from .records.record import Record
 
@@ -101,7 +101,7 @@ class KnownPlant:
             system,
             space,
             np.stack([*{tuple(start): start for start in starts}.values()]),
-            own=tuple(p for p in ranges if p == OFFSET or p.endswith("rest_input")),
+            own=tuple(filter(is_own, ranges)),
             dynamics=tuple(filter(_is_linear, ranges)),
             whitening=shown.whitening if shown.modes else (),
             prior=prior,

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from ..signals.excitation import Part
+from ..tuning.next_record import RecordReport
 from .figures import AFTER, Pictures, figure, plot_style, write
 from .page import Page
 
@@ -16,18 +17,76 @@ PICTURE = "excitation.png"
 
 def excitation_page(parts: Sequence[Part], files: Mapping[str, Part]) -> Page:
     """Return the Page of ``parts``, with the length of each of ``files`` (by name)."""
+    notes = [
+        "the stage must not reach its mechanical limits: on a new stage, begin with a "
+        "small part of the range",
+    ]
+    tables = [excitation_table(parts)]
+    return Page("voltages to record", (), [*tables, *_how_to_record(files), *notes])
+
+
+def next_record_page(
+    report: RecordReport, part: Part, files: Mapping[str, Part]
+) -> Page:
+    """Return the Page of a designed record: what it will tell, and how to record it."""
+    notes = [
+        f"the errors are for a plant of the class of the model and white noise of "
+        f"{1e3 * report.noise_rms_um:.3g} nm rms; what the model leaves out comes on "
+        "top: judge the new model on another record (python -m piezojax.validate)",
+    ]
+    tables = [figures_table(report), parameters_table(report), excitation_table([part])]
+    return Page("the next record", (), [*tables, *_how_to_record(files), *notes])
+
+
+def figures_table(report: RecordReport) -> Table:
+    """Return the promised figures, with their errors after two records."""
+    table = Table(
+        title="standard errors of the promised figures",
+        caption=f"designed: {report.designed_s:.3g} s; usual: ladder, holds and "
+        f"multisine, {report.usual_s:.3g} s",
+    )
+    table.add_column("figure")
+    for name in ("promised", "designed, %", "usual, %"):
+        table.add_column(name, justify="right")
+    for each in report.figures:
+        table.add_row(
+            each.name,
+            f"{each.value:.4g} {each.unit.replace('1', '')}".rstrip(),
+            *(f"{100.0 * error:.3g}" for error in (each.designed, each.usual)),
+        )
+    return table
+
+
+def parameters_table(report: RecordReport) -> Table:
+    """Return the parameters of the plant, with their errors after three records."""
+    table = Table(title="standard errors of the parameters of the plant")
+    table.add_column("parameter")
+    for name in ("value", "unit", "first fit", "designed", "usual"):
+        table.add_column(name, justify="left" if name == "unit" else "right")
+    for each in report.parameters:
+        table.add_row(
+            each.path,
+            f"{each.value:.5g}",
+            each.unit,
+            "" if each.first is None else f"{each.first:.2g}",
+            f"{each.designed:.2g}",
+            f"{each.usual:.2g}",
+        )
+    return table
+
+
+def _how_to_record(files: Mapping[str, Part]) -> list[str]:
+    """Return sentences on the length and the use of ``files``."""
     sizes = [
         f"{name}: {part.voltages.size} samples at {part.rate:.6g} Hz, "
         f"{part.voltages.size / part.rate:.3g} s"
         for name, part in files.items()
     ]
-    notes = [
+    return [
+        *sizes,
         "start with the stage at rest; record voltage and displacement at the rate of "
         "the control loop, from the first sample on",
-        "the stage must not reach its mechanical limits: on a new stage, begin with a "
-        "small part of the range",
     ]
-    return Page("voltages to record", (), [excitation_table(parts), *sizes, *notes])
 
 
 def excitation_table(parts: Iterable[Part]) -> Table:

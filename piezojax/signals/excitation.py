@@ -5,7 +5,7 @@ with different random numbers: a model is fitted to the first half and validated
 second.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from math import ceil
 from typing import NamedTuple
@@ -25,8 +25,14 @@ PHASES = 50
 EDGE = 0.02
 """Shortest duration of a move between levels, s; a low slew rate lengthens it."""
 
+REST = 0.1
+"""Duration of the rest before the parts of a record, s."""
+
 COARSEST = 50
 """Smallest number of samples in a cycle over the whole range."""
+
+STRETCHES = 2, 9
+"""Number of stretches in a mixture, the upper end excluded."""
 
 LADDER = ((1.0, 1.0, 2, 1.0), (2.5, 0.6, 6, 0.15), (7.0, 0.2, 4, 1.0))
 """Groups of cycles: over the whole range, nested loops that shrink, and small loops.
@@ -100,6 +106,17 @@ class Generator:
         duration = max(EDGE, 0.5 * np.pi * abs(height) / self.slew)
         share = self.time(duration) / duration
         return start + 0.5 * height * (1.0 - np.cos(np.pi * share))
+
+    def followed(self, wanted: np.ndarray) -> np.ndarray:
+        """Return the voltages that follow ``wanted`` [samples] within the slew rate, V.
+
+        They begin at the middle of the range.
+        """
+        voltages, most = [self.middle], self.slew / self.rate
+        for voltage in wanted[1:]:
+            move = min(max(voltage - voltages[-1], -most), most)
+            voltages.append(voltages[-1] + move)
+        return np.array(voltages)
 
 
 class Part(NamedTuple):
@@ -187,6 +204,33 @@ def multisine(generator: Generator, random: np.random.Generator) -> Part:
     return Part("multisine", voltages, generator.rate, tells)
 
 
+def mixture(
+    generator: Generator, samples: int, random: np.random.Generator
+) -> np.ndarray:
+    """Return voltages [samples] of random stretches, V.
+
+    A stretch has two levels, many levels or a sine, of random height, base and
+    frequency. Moves between levels have the slew rate of ``generator``.
+    """
+    count = random.integers(*STRETCHES)
+    cuts = np.sort(random.integers(0, samples, count - 1))
+    wanted = np.empty(samples)
+    for start, stop in zip([0, *cuts], [*cuts, samples], strict=True):
+        height = 0.5 * generator.span * 10.0 ** random.uniform(-1.5, 0.0)
+        base = random.uniform(generator.lower + height, generator.upper - height)
+        lowest = min(2.0 * generator.rate / samples, generator.top)
+        frequency = np.exp(random.uniform(*np.log([lowest, generator.top])))
+        turns = frequency * np.arange(stop - start) / generator.rate
+        halves = np.floor(2.0 * turns).astype(int)
+        shapes = (
+            random.choice([-1.0, 1.0], halves.size + 1)[halves],
+            random.uniform(-1.0, 1.0, halves.size + 1)[halves],
+            np.sin(2.0 * np.pi * turns),
+        )
+        wanted[start:stop] = base + height * shapes[random.integers(len(shapes))]
+    return generator.followed(wanted)
+
+
 PARTS: tuple[Callable[[Generator, np.random.Generator], Part], ...] = (
     *(ladder, holds, multisine),
 )
@@ -203,9 +247,15 @@ def excitation(generator: Generator, seed: int = 0) -> tuple[list[Part], np.ndar
         [part(generator, np.random.default_rng([seed, half])) for part in PARTS]
         for half in (0, 1)
     ]
-    rest = np.full(generator.time(0.1).size, generator.middle)
-    whole = [rest, *(part.voltages for half in halves for part in half)]
-    return halves[0], np.concatenate(whole)
+    return halves[0], after_rest(
+        generator, [part.voltages for half in halves for part in half]
+    )
+
+
+def after_rest(generator: Generator, parts: Iterable[np.ndarray]) -> np.ndarray:
+    """Return the voltages of a record: a rest at the middle of the range, and parts."""
+    rest = np.full(generator.time(REST).size, generator.middle)
+    return np.concatenate([rest, *parts])
 
 
 def buffered(generator: Generator, points: int, seed: int = 0) -> list[Part]:

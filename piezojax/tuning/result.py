@@ -1,6 +1,7 @@
 """Result of tuning: the content of ``result.json``, and its reader."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -9,10 +10,13 @@ from pydantic import BaseModel, ConfigDict
 
 from ..analysis.constraints import CONSTRAINTS, LoopFigures, worst_by_plant
 from ..analysis.stability.measured_margins import MeasuredMargins
+from ..core.feedback import Feedback
 from ..core.files import read_model
 from ..core.metrics import TrackingFigures
+from ..core.serial import load
 from ..solve.problem import TOLERANCE
 from ..solve.search_state import Status
+from ..study import Case, read
 from .drive import Drive
 from .objective import RAILED
 from .sliding import SlidingShare
@@ -329,3 +333,16 @@ def load_result(path: str | Path) -> Result:
     path = Path(path)
     path = path / RESULT_FILE if path.is_dir() else path
     return read_model(Result, path, "is not a result of tuning")
+
+
+def load_loop(
+    folder: Path, study: Path | None = None, *, accept_unsafe: bool = False
+) -> tuple[Case, Feedback]:
+    """Return the Case and the tuned loop of a ``folder`` of ``tune``.
+
+    ``study`` is the file of the study, by default the one in the folder. Raises
+    ValueError as ``study.read`` and ``load`` do.
+    """
+    case = read(study or folder / STUDY_FILE)
+    controller = load(folder / GAINS_FILE, accept_unsafe=accept_unsafe)
+    return case, replace(case.loop, controller=controller)
