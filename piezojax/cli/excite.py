@@ -4,14 +4,7 @@ from pathlib import Path
 
 import click
 
-from .command import (
-    Command,
-    common,
-    print_loading,
-    print_results,
-    results_folder,
-    run,
-)
+from .command import Command, common, print_loading, print_results, results_folder, run
 from .terminal import Bar
 
 RECORD, DESIGNED = "record.csv", "designed.csv"
@@ -92,9 +85,7 @@ def main(results, duration, points, out, seed, quiet, **limits):
 
 def _write_usual(limits, points, out, seed, console):
     """Write the voltages for a stage that is not known yet."""
-    from ..core.files import write_text
-    from ..report.excitation_pictures import excitation_page, write_excitation
-    from ..report.page import write_page
+    from ..report.excitation_pictures import excitation_page
     from ..signals.excitation import Generator, Part, buffered, excitation
 
     generator = Generator(**limits)
@@ -105,11 +96,8 @@ def _write_usual(limits, points, out, seed, console):
         parts = buffered(generator, points, seed or 0)
         files = {f"{part.name}.csv": part for part in parts}
     with results_folder(out, "excitation") as folder:
-        for name, part in files.items():
-            write_text(folder / name, csv_of(part))
-        pictures = write_excitation(parts, folder)
         page = excitation_page(parts, files)
-        write_page(page, folder, pictures)
+        _write(folder, files, parts, page)
     print_results(page, folder, console)
 
 
@@ -117,8 +105,7 @@ def _write_designed(results, limits, duration, points, out, seed, console):
     """Write the voltages designed for the gains and the plant in ``results``."""
     print_loading(console)
     from ..core.files import write_text
-    from ..report.excitation_pictures import next_record_page, write_excitation
-    from ..report.page import write_page
+    from ..report.excitation_pictures import next_record_page
     from ..signals.excitation import Generator, Part, after_rest
     from ..tuning.next_record import EXPECTED_FILE, next_record
     from ..tuning.result import load_loop
@@ -146,13 +133,21 @@ def _write_designed(results, limits, duration, points, out, seed, console):
             files = {RECORD: Part("record", whole, generator.rate, "")}
         else:
             files = {DESIGNED: part}
-        for name, each in files.items():
-            write_text(folder / name, csv_of(each))
         write_text(folder / EXPECTED_FILE, found.report.model_dump_json(indent=2))
-        pictures = write_excitation([part], folder)
         page = next_record_page(found.report, part, files)
-        write_page(page, folder, pictures)
+        _write(folder, files, [part], page)
     print_results(page, folder, console)
+
+
+def _write(folder, files, parts, page):
+    """Write the voltages of ``files``, the picture of ``parts``, and the page."""
+    from ..core.files import write_text
+    from ..report.excitation_pictures import write_excitation
+    from ..report.page import write_page
+
+    for name, part in files.items():
+        write_text(folder / name, csv_of(part))
+    write_page(page, folder, write_excitation(parts, folder))
 
 
 def csv_of(part) -> str:

@@ -67,15 +67,6 @@ KNOWN = 0.1
 """Relative standard error below which a parameter counts as determined."""
 
 
-def limited(wanted, generator):
-    """Return the voltages that follow ``wanted`` within the slew rate."""
-    most, voltage, found = generator.slew / generator.rate, generator.middle, []
-    for target in wanted:
-        voltage += min(max(target - voltage, -most), most)
-        found.append(voltage)
-    return np.array(found)
-
-
 def others(generator, samples, random):
     """Yield kind, name and voltages of each of the other records."""
     time, duration = np.arange(samples) / generator.rate, samples / generator.rate
@@ -94,7 +85,7 @@ def others(generator, samples, random):
             bits = random.choice([-1.0, 1.0], samples // clock + 1)
             wanted = generator.middle + height * np.repeat(bits, clock)[:samples]
             name = f"{1e3 * clock / generator.rate:.3g} ms, {height:.3g} V"
-            yield "PRBS", name, limited(wanted, generator)
+            yield "PRBS", name, generator.followed(wanted)
 
 
 @eqx.filter_jit

@@ -268,7 +268,7 @@ def test_the_designed_record_is_better_than_others_of_the_same_limits(task, desi
 
 
 def test_estimates_scatter_as_predicted(task, designed):
-    """Linear least squares on 400 records with noise, in NumPy, from a wrong start."""
+    """Linear least squares on 400 records with noise, in NumPy."""
     figures, parameters = task.errors(designed)
     random = np.random.default_rng(11)
     true, jacobian = numpy_output(TRUE, designed), numpy_jacobian(designed)
