@@ -231,6 +231,21 @@ def mixture(
     return generator.followed(wanted)
 
 
+def two_levels(
+    generator: Generator, samples: int, random: np.random.Generator
+) -> np.ndarray:
+    """Return voltages [samples] that jump between two levels around the middle, V.
+
+    The levels follow each other at random, as in a pseudo-random binary sequence, of a
+    random clock and height. Moves have the slew rate of ``generator``.
+    """
+    height = 0.5 * generator.span * 10.0 ** random.uniform(-1.0, 0.0)
+    clock = int(np.exp(random.uniform(0.0, np.log(max(2.0, 0.1 * samples)))))
+    bits = random.choice([-1.0, 1.0], samples // clock + 1)
+    wanted = generator.middle + height * np.repeat(bits, clock)[:samples]
+    return generator.followed(wanted)
+
+
 PARTS: tuple[Callable[[Generator, np.random.Generator], Part], ...] = (
     *(ladder, holds, multisine),
 )

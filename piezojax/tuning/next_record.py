@@ -18,7 +18,7 @@ from ..identification.information import Unknowns
 from ..signals.excitation import Generator, excitation
 from ..study import Case
 from .promised_figures import PromisedFigure, promised_figures
-from .record_search import RecordSearch, best_voltages, most_reports
+from .record_search import RecordSearch, best_voltages, report_count
 
 DESCENTS = 4, 1
 """Number of descents for the part to fit and for the part to validate on."""
@@ -130,7 +130,7 @@ def next_record(
             f"takes {samples - left} at {generator.slew:g} V/s"
         )
     task = make_task(case, loop, generator, left, unknowns_of(case))
-    progress.stage("designing the record", sum(map(most_reports, DESCENTS)))
+    progress.stage("designing the record", sum(map(report_count, DESCENTS)))
 
     def show(loss: float) -> None:
         rms = 100.0 * np.exp(loss) / np.sqrt(len(task.figures))

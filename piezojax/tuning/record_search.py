@@ -2,34 +2,28 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.optimize import minimize
 
 from ..core.arrays import as_array
 from ..identification.information import Unknowns
-from ..signals.excitation import Generator, mixture
+from ..signals.excitation import Generator, mixture, two_levels
 
 TRIALS = 200
 """Number of random records; a descent begins at each of the best."""
 
-ROUGH, ROUND, ROUNDS = 60, 150, 4
-"""Largest number of steps of each descent, of a round of the best one afterwards, and
-of its rounds. A round begins without the curvature of the one before, because the slope
-of a hysteresis jumps and the limits of the range hide slopes."""
+ROUGH, FINE = 60, 1000
+"""Numbers of steps of each descent, and of the best one afterwards."""
 
-SETTLED, GAIN = 1e-6, 0.005
-"""Relative change of the loss below which a descent ends, and decrease of the loss in a
-round below which no other one follows."""
+LARGEST, SMALLEST = 0.02, 2e-4
+"""Change of every move by the first and by the last step of a descent."""
 
-MEMORY = 20
-"""Number of steps from which L-BFGS estimates the curvature."""
+MOMENTUM = 0.95
+"""Share of the earlier slopes in the direction of a step."""
 
 VAGUE = 100.0
 """Standard deviation (um) of the zero of the sensor before the record. That of a
@@ -96,16 +90,16 @@ def _loss(search: RecordSearch, moves: Array) -> Array:
     return search.loss(moves)
 
 
-def _loss_and_slope(
-    search: RecordSearch, moves: np.ndarray
-) -> tuple[float, np.ndarray]:
-    loss, slope = _differentiated(search, as_array(moves))
-    return float(loss), np.asarray(slope, float)
-
-
 @eqx.filter_jit
-def _differentiated(search: RecordSearch, moves: Array) -> tuple[Array, Array]:
-    return jax.value_and_grad(search.loss)(moves)
+def _stepped(
+    search: RecordSearch, moves: Array, direction: Array, size: Array
+) -> tuple[Array, Array, Array]:
+    """Return the loss at ``moves``, and the moves and direction of the next step."""
+    loss, slope = jax.value_and_grad(search.loss)(moves)
+    scale = jnp.maximum(jnp.mean(jnp.abs(slope)), jnp.finfo(float).tiny)
+    direction = MOMENTUM * direction - slope / scale
+    moved = jnp.clip(moves + size * jnp.sign(direction), -1.0, 1.0)
+    return loss, moved, direction
 
 
 @dataclass(frozen=True, order=True)
@@ -116,9 +110,9 @@ class Point:
     moves: np.ndarray = field(compare=False)
 
 
-def most_reports(descents: int) -> int:
-    """Return the largest number of reports of ``best_voltages``."""
-    return TRIALS + descents * ROUGH + ROUNDS * ROUND
+def report_count(descents: int) -> int:
+    """Return the number of reports of ``best_voltages``."""
+    return TRIALS + descents * ROUGH + FINE
 
 
 def best_voltages(
@@ -130,35 +124,37 @@ def best_voltages(
 ) -> Float[np.ndarray, " samples"]:
     """Return the voltages (V) of the least loss that is found.
 
-    L-BFGS with bounds descends a little from the best ``descents`` of ``TRIALS`` random
-    records, and then from the best point, with gradients through the simulation. The
-    loss has many minima. ``report`` is called with the loss after each record and each
-    step.
+    Descents begin at the best ``descents`` of ``TRIALS`` random records; the best of
+    them continues. ``report`` is called with the least loss so far after each record
+    and each step.
     """
     points: list[Point] = []
-    for _ in range(TRIALS):
-        moves = search.moves(mixture(generator, search.samples, random))
+    for trial in range(TRIALS):
+        drawn = (mixture, two_levels)[trial % 2]
+        moves = search.moves(drawn(generator, search.samples, random))
         points.append(Point(float(_loss(search, as_array(moves))), moves))
         report(min(points).loss)
     starts = sorted(points)[:descents]
-    best = min(_descended(search, start, ROUGH, report) for start in starts)
-    for _ in range(ROUNDS):
-        before, best = best, _descended(search, best, ROUND, report)
-        if before.loss - best.loss < GAIN:
-            break
+    rough = [_descended(search, start, ROUGH, report) for start in starts]
+    best = _descended(search, min(rough), FINE, report)
     return np.asarray(search.voltages(as_array(best.moves)))
 
 
 def _descended(
-    search: RecordSearch, start: Point, steps: int, report: Callable[[float], None]
+    search: RecordSearch, best: Point, steps: int, report: Callable[[float], None]
 ) -> Point:
-    found: Any = minimize(
-        partial(_loss_and_slope, search),
-        start.moves,
-        jac=True,
-        method="L-BFGS-B",
-        bounds=[(-1.0, 1.0)] * start.moves.size,
-        callback=lambda intermediate_result: report(float(intermediate_result.fun)),
-        options={"maxiter": steps, "maxcor": MEMORY, "ftol": SETTLED},
-    )
-    return min(start, Point(float(found.fun), found.x))
+    """Return the best point of a descent from ``best``, with momentum.
+
+    A step changes all moves equally, by the sign of the direction (Bernstein et al.,
+    signSGD, ICML 2018). Most moves of a good record are the largest that are allowed,
+    and the slope of a hysteresis jumps: a line search along the slope, as in L-BFGS,
+    ends at the first jump.
+    """
+    moves, direction = as_array(best.moves), jnp.zeros(search.knots)
+    shares = 0.5 + 0.5 * np.cos(np.linspace(0.0, np.pi, steps))
+    for size in SMALLEST + (LARGEST - SMALLEST) * shares:
+        loss, moved, direction = _stepped(search, moves, direction, as_array(size))
+        best = min(best, Point(float(loss), np.asarray(moves)))
+        moves = moved
+        report(best.loss)
+    return best

@@ -20,7 +20,7 @@ import piezojax as pj
 from piezojax.core.feedback import loop_inputs
 from piezojax.core.rollout import simulate
 from piezojax.identification.records.sampled import read_sampled
-from piezojax.signals.excitation import Generator, mixture
+from piezojax.signals.excitation import Generator, mixture, two_levels
 from piezojax.study import read
 from piezojax.tuning import record_search
 from piezojax.tuning.next_record import make_task, next_record, unknowns_of
@@ -212,6 +212,7 @@ def test_no_point_of_the_search_exceeds_the_limits(
     for voltages in (
         np.asarray(search.voltages(jnp.asarray(moves))),
         mixture(generator, samples, random),
+        two_levels(generator, samples, random),
     ):
         assert voltages.shape == (samples,)
         assert voltages[0] == pytest.approx(50.0)
@@ -226,6 +227,28 @@ def test_the_moves_of_voltages_give_these_voltages(task):
     assert task.search.every == 1
     found = task.search.voltages(jnp.asarray(moves))
     np.testing.assert_allclose(found, voltages, atol=1e-9)
+
+
+def test_two_levels_lie_around_the_middle_of_the_range():
+    fast = Generator(-20.0, 120.0, RATE, 1e9)
+    voltages = two_levels(fast, SAMPLES, np.random.default_rng(3))
+    levels = np.unique(voltages[1:].round(9))
+    assert levels.size == 2
+    assert levels.mean() == pytest.approx(50.0)
+
+
+def test_a_descent_reports_the_least_loss_and_returns_it(task, monkeypatch):
+    monkeypatch.setattr(record_search, "TRIALS", 4)
+    monkeypatch.setattr(record_search, "ROUGH", 5)
+    monkeypatch.setattr(record_search, "FINE", 8)
+    losses = []
+    found = record_search.best_voltages(
+        task.search, GENERATOR, 2, np.random.default_rng(0), losses.append
+    )
+    assert len(losses) == record_search.report_count(2) == 4 + 2 * 5 + 8
+    assert losses[-1] == min(losses) < losses[3]
+    loss = task.search.loss(jnp.asarray(task.search.moves(found)))
+    assert float(loss) == pytest.approx(losses[-1], abs=1e-6)
 
 
 def test_the_slope_of_the_loss_is_that_of_finite_differences(task):
@@ -290,8 +313,7 @@ def test_estimates_scatter_as_predicted(task, designed):
 def test_a_record_begins_and_ends_at_the_middle_and_repeats(case, monkeypatch):
     monkeypatch.setattr(record_search, "TRIALS", 3)
     monkeypatch.setattr(record_search, "ROUGH", 2)
-    monkeypatch.setattr(record_search, "ROUNDS", 1)
-    monkeypatch.setattr(record_search, "ROUND", 2)
+    monkeypatch.setattr(record_search, "FINE", 2)
     one, two = (next_record(case, case.loop, GENERATOR, 200, seed=5) for _ in range(2))
     np.testing.assert_array_equal(one.fit, two.fit)
     for half in (one.fit, one.validate):
@@ -334,7 +356,7 @@ def results(tmp_path, monkeypatch):
     """Return a folder of tune for the study, and make the search short."""
     monkeypatch.setattr(record_search, "TRIALS", 3)
     monkeypatch.setattr(record_search, "ROUGH", 2)
-    monkeypatch.setattr(record_search, "ROUNDS", 0)
+    monkeypatch.setattr(record_search, "FINE", 2)
     short = {"optimiser": {"starts": 1, "candidates": 2, "steps": 2}}
     study = write_study(tmp_path, short)
     tuned = call("tune", study, "--out", tmp_path / "tuned")
