@@ -23,6 +23,10 @@ from .record_search import RecordSearch, best_voltages, report_count
 DESCENTS = 4, 1
 """Number of descents for the part to fit and for the part to validate on."""
 
+NOTHING_KNOWN = 1e3
+"""Vagueness before the record in the errors to expect. A fit to the record alone uses
+no other knowledge; the search does, so that one vague parameter does not rule it."""
+
 LEAST = 0.5
 """Least share of a record in front of its move back to the middle of the range."""
 
@@ -59,8 +63,8 @@ class ExpectedParameter(BaseModel):
 class RecordReport(BaseModel):
     """Errors to expect after a designed record, the content of ``expected.json``.
 
-    They are those of the first half of each record, of ``designed_s`` and ``usual_s``
-    (s), with white noise of ``noise_rms_um``.
+    They are those of a fit to the first half of each record alone, of ``designed_s``
+    and ``usual_s`` (s), with white noise of ``noise_rms_um``.
     """
 
     noise_rms_um: float
@@ -99,7 +103,7 @@ class RecordTask(NamedTuple):
 
 @eqx.filter_jit
 def _covariance(search: RecordSearch, voltages: Array) -> Array:
-    return search.covariance(voltages)
+    return search.covariance(voltages, NOTHING_KNOWN)
 
 
 def next_record(

@@ -73,11 +73,19 @@ class RecordSearch(eqx.Module):
         knots = np.minimum(self.every * np.arange(self.knots + 1), self.samples - 1)
         return np.clip(np.diff(voltages[knots]) / float(self.most), -1.0, 1.0)
 
-    def covariance(self, voltages: Float[Array, " samples"]) -> Float[Array, "n n"]:
-        """Return the covariance of the parameters after a record of ``voltages``."""
+    def covariance(
+        self, voltages: Float[Array, " samples"], vagueness: float = 1.0
+    ) -> Float[Array, "n n"]:
+        """Return the covariance of the parameters after a record of ``voltages``.
+
+        The standard deviations before the record are multiplied by ``vagueness``.
+        """
         found = self.unknowns.information(voltages, self.noise)
-        before = jnp.ones(len(found)).at[-1].set(1.0 / VAGUE**2)
-        return jnp.linalg.inv(found + jnp.diag(before))[:-1, :-1]
+        before = jnp.ones(len(found)).at[-1].set(1.0 / VAGUE**2) / vagueness**2
+        found = found + jnp.diag(before)
+        root = jnp.sqrt(jnp.diag(found))
+        inverse = jnp.linalg.inv(found / jnp.outer(root, root))
+        return (inverse / jnp.outer(root, root))[:-1, :-1]
 
     def loss(self, moves: Float[Array, " knots"]) -> Float[Array, ""]:
         """Return half the logarithm of the summed relative variances of the figures."""
