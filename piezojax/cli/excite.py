@@ -10,6 +10,9 @@ from .terminal import Bar
 RECORD, DESIGNED = "record.csv", "designed.csv"
 """File names of a whole record, and of a designed one for a small buffer."""
 
+SECONDS = 1.0
+"""Duration of each half of a designed record, s, unless it is given."""
+
 NEEDED = "lower", "upper", "rate"
 """Options that RESULTS replace."""
 
@@ -43,9 +46,8 @@ NEEDED = "lower", "upper", "rate"
 @click.option(
     "--duration",
     type=click.FloatRange(min=0.0, min_open=True),
-    default=1.0,
-    show_default=True,
-    help="Duration of each half of a designed record, s.",
+    help="Duration of each half of a designed record, s "
+    f"(default: {SECONDS:g}).",
 )
 @click.option(
     "--points",
@@ -66,13 +68,24 @@ def main(results, duration, points, out, seed, quiet, **limits):
     With RESULTS, a folder of tune with a fitted plant, the voltages are designed for
     this plant and these gains: they make the errors of the promised figures small that
     the errors of the plant cause. Limits and rate are those of its study by default.
+    Ctrl-C ends the search for a half of the record, and keeps the best one so far.
     """
 
     def body(console):
         known = {name: value for name, value in limits.items() if value is not None}
         if results is not None:
+            if points is not None and duration is not None:
+                raise ValueError(
+                    "--points and --duration both set the length of a designed "
+                    "record; leave one out"
+                )
             _write_designed(results, known, duration, points, out, seed, console)
             return
+        if duration is not None:
+            raise ValueError(
+                "--duration is that of a designed record; give RESULTS, or set the "
+                "duration of the usual record by --slowest and --hold"
+            )
         if missing := [f"--{name}" for name in NEEDED if name not in known]:
             raise ValueError(
                 f"{missing[0]} is missing; without RESULTS, give "
@@ -121,7 +134,7 @@ def _write_designed(results, limits, duration, points, out, seed, console):
             "rate": case.study.rate,
         }
         generator = Generator(**(of_study | limits))
-        samples = points or round(duration * generator.rate)
+        samples = points or round((duration or SECONDS) * generator.rate)
         found = next_record(
             case, loop, generator, samples, seed=seed or 0, progress=bar
         )

@@ -1,6 +1,6 @@
 """Search for the voltages of a record that determines given figures best."""
 
-from collections.abc import Callable
+from collections import abc
 from dataclasses import dataclass, field
 
 import equinox as eqx
@@ -118,6 +118,11 @@ class Point:
     moves: np.ndarray = field(compare=False)
 
 
+def point_of(loss: Array, moves: np.ndarray) -> Point:
+    """Return the point at ``moves``, the worst of all if its loss is not finite."""
+    return Point(float(loss) if np.isfinite(loss) else np.inf, moves)
+
+
 def report_count(descents: int) -> int:
     """Return the number of reports of ``best_voltages``."""
     return TRIALS + descents * ROUGH + FINE
@@ -128,30 +133,54 @@ def best_voltages(
     generator: Generator,
     descents: int,
     random: np.random.Generator,
-    report: Callable[[float], None],
+    report: abc.Callable[[float], None],
 ) -> Float[np.ndarray, " samples"]:
     """Return the voltages (V) of the least loss that is found.
 
     Descents begin at the best ``descents`` of ``TRIALS`` random records; the best of
     them continues. ``report`` is called with the least loss so far after each record
-    and each step.
+    and each step. Ctrl-C ends the search with the best record so far. Raises ValueError
+    if no random record has a finite loss.
     """
-    points: list[Point] = []
-    for trial in range(TRIALS):
-        drawn = (mixture, two_levels)[trial % 2]
-        moves = search.moves(drawn(generator, search.samples, random))
-        points.append(Point(float(_loss(search, as_array(moves))), moves))
-        report(min(points).loss)
-    starts = sorted(points)[:descents]
-    rough = [_descended(search, start, ROUGH, report) for start in starts]
-    best = _descended(search, min(rough), FINE, report)
+    best = Point(np.inf, np.zeros(search.knots))
+    try:
+        for point in _points(search, generator, descents, random):
+            best = min(best, point)
+            report(best.loss)
+    except KeyboardInterrupt:
+        if best.loss == np.inf:
+            raise
     return np.asarray(search.voltages(as_array(best.moves)))
 
 
-def _descended(
-    search: RecordSearch, best: Point, steps: int, report: Callable[[float], None]
-) -> Point:
-    """Return the best point of a descent from ``best``, with momentum.
+def _points(
+    search: RecordSearch,
+    generator: Generator,
+    descents: int,
+    random: np.random.Generator,
+) -> abc.Iterator[Point]:
+    """Yield the points of the random records and of the descents."""
+    points = []
+    for trial in range(TRIALS):
+        drawn = (mixture, two_levels)[trial % 2]
+        moves = search.moves(drawn(generator, search.samples, random))
+        points.append(point_of(_loss(search, as_array(moves)), moves))
+        yield points[-1]
+    if min(points).loss == np.inf:
+        raise ValueError(
+            "the plant, or its change with its parameters, is not finite in any of the "
+            "random records: no record can be designed for this model"
+        )
+    rough = []
+    for start in sorted(points)[:descents]:
+        rough.append((yield from _descent(search, start, ROUGH)))
+    yield from _descent(search, min(rough), FINE)
+
+
+def _descent(
+    search: RecordSearch, best: Point, steps: int
+) -> abc.Generator[Point, None, Point]:
+    """Yield the points of a descent from ``best`` with momentum, return the best.
 
     A step changes all moves equally, by the sign of the direction (Bernstein et al.,
     signSGD, ICML 2018). Most moves of a good record are the largest that are allowed,
@@ -162,7 +191,7 @@ def _descended(
     shares = 0.5 + 0.5 * np.cos(np.linspace(0.0, np.pi, steps))
     for size in SMALLEST + (LARGEST - SMALLEST) * shares:
         loss, moved, direction = _stepped(search, moves, direction, as_array(size))
-        best = min(best, Point(float(loss), np.asarray(moves)))
-        moves = moved
-        report(best.loss)
+        point = point_of(loss, np.asarray(moves))
+        best, moves = min(best, point), moved
+        yield point
     return best

@@ -251,6 +251,60 @@ def test_a_descent_reports_the_least_loss_and_returns_it(task, monkeypatch):
     assert float(loss) == pytest.approx(losses[-1], abs=1e-6)
 
 
+def test_an_interrupted_search_returns_the_best_record_so_far(task):
+    losses = []
+
+    def interrupted(loss):
+        losses.append(loss)
+        if len(losses) == 7:
+            raise KeyboardInterrupt
+
+    found = record_search.best_voltages(
+        task.search, GENERATOR, 2, np.random.default_rng(0), interrupted
+    )
+    assert len(losses) == 7
+    loss = task.search.loss(jnp.asarray(task.search.moves(found)))
+    assert float(loss) == pytest.approx(losses[-1], abs=1e-6)
+
+
+def test_an_interruption_before_the_first_record_ends_the_design(task, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(record_search, "mixture", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        record_search.best_voltages(
+            task.search, GENERATOR, 1, np.random.default_rng(0), print
+        )
+
+
+def test_a_record_without_a_finite_loss_is_never_the_best(task, monkeypatch):
+    monkeypatch.setattr(record_search, "TRIALS", 4)
+    monkeypatch.setattr(record_search, "ROUGH", 2)
+    monkeypatch.setattr(record_search, "FINE", 2)
+    actual, calls = record_search._loss, []
+
+    def first_is_not_finite(search, moves):
+        calls.append(None)
+        return jnp.asarray(jnp.nan) if len(calls) == 1 else actual(search, moves)
+
+    monkeypatch.setattr(record_search, "_loss", first_is_not_finite)
+    losses = []
+    record_search.best_voltages(
+        task.search, GENERATOR, 1, np.random.default_rng(0), losses.append
+    )
+    assert losses[0] == np.inf
+    assert np.isfinite(losses[1:]).all()
+
+
+def test_a_model_without_finite_records_is_refused(task):
+    search = dataclasses.replace(task.search, noise=jnp.asarray(jnp.nan))
+    with pytest.raises(ValueError, match="not finite in any of the random records"):
+        record_search.best_voltages(
+            search, GENERATOR, 1, np.random.default_rng(0), lambda loss: None
+        )
+
+
 def test_the_slope_of_the_loss_is_that_of_finite_differences(task):
     # A hysteresis has no slope where a move is 0.
     moves = np.random.default_rng(2).uniform(-0.9, 0.9, task.search.knots)
@@ -407,3 +461,19 @@ def test_a_record_without_results_needs_its_limits():
     assert refused.exit_code == 1
     message = "--upper is missing; without RESULTS, give --lower, --upper, --rate"
     assert message in refused.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--duration", "2"), "--duration is that of a designed record; give RESULTS"),
+        (
+            ("anywhere", "--duration", "2", "--points", "256"),
+            "--points and --duration both set the length of a designed record; leave",
+        ),
+    ],
+)
+def test_options_of_the_other_kind_of_record_are_refused(options, message):
+    refused = call("excite", *options)
+    assert refused.exit_code == 1
+    assert message in " ".join(refused.stderr.split())
