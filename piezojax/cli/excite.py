@@ -46,8 +46,7 @@ NEEDED = "lower", "upper", "rate"
 @click.option(
     "--duration",
     type=click.FloatRange(min=0.0, min_open=True),
-    help="Duration of each half of a designed record, s "
-    f"(default: {SECONDS:g}).",
+    help=f"Duration of each half of a designed record, s (default: {SECONDS:g}).",
 )
 @click.option(
     "--points",

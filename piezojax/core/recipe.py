@@ -29,8 +29,10 @@ class Extent(NamedTuple):
     ``modes``, ``lags`` and ``delay`` are the linear dynamics that the record shows,
     from which a recipe takes its starting values, the strongest resonance first.
     ``slew`` is the slew rate of the amplifier. ``modes`` and ``lags`` are empty,
-    ``delay`` and ``slew`` None, if none were found or no search was made. ``reach``
-    multiplies the distance of the bounds from the modes that were found.
+    ``delay`` and ``slew`` None, if none were found or no search was made. ``jump`` is
+    the largest step of the input if its few steps may hide a slew rate in ``delay``,
+    else 0. ``reach`` multiplies the distance of the bounds from the modes that were
+    found.
     """
 
     low: float  # V
@@ -45,6 +47,7 @@ class Extent(NamedTuple):
     lags: tuple[float, ...] = ()  # s, time constants
     delay: float | None = None  # s
     slew: float | None = None  # V/s
+    jump: float = 0.0  # V
     reach: float = 1.0
 
     def mirrored(self) -> "Extent":
@@ -65,7 +68,9 @@ class Recipe(NamedTuple):
     its path in ``system``. ``alternatives`` holds an entry for each start: the values
     that differ from ``system``, by path. ``gain`` is the path of a parameter that only
     scales the output. ``own`` holds the paths of parameters with a separate value for
-    each record: the state before it began.
+    each record: the state before it began. ``vague`` holds those of the terms of a sum,
+    which only records of every kind of motion determine one by one; their first guesses
+    are typical values.
     """
 
     system: System
@@ -73,6 +78,7 @@ class Recipe(NamedTuple):
     alternatives: Sequence[Mapping[str, float]] = ({},)
     gain: str | None = None
     own: tuple[str, ...] = ()
+    vague: tuple[str, ...] = ()
 
 
 class Part(NamedTuple):

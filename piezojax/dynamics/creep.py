@@ -78,9 +78,11 @@ class ExponentialCreep(Fittable):
     @classmethod
     def recipe(cls, extent: Extent) -> Recipe:
         times = np.geomspace(*_creep_times(extent), 4)
+        gains = tuple(f"gains.{i}" for i in range(4))
         return Recipe(
             cls((0.01,) * 4, times, extent.dt),
-            {f"gains.{i}": Range(-LARGEST, LARGEST) for i in range(4)},
+            dict.fromkeys(gains, Range(-LARGEST, LARGEST)),
+            vague=gains,
         )
 
     def init(self, input: ScalarLike = 0.0) -> Lags:

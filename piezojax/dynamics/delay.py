@@ -12,6 +12,9 @@ from ..core.space import Range
 NEAR = 0.25
 """Largest change, in samples, that a fit makes to a delay estimated from the record."""
 
+RAMP = 2.0
+"""The same, if the delay may contain the ramp of a step at an unknown slew rate."""
+
 
 class FractionalDelay(Fittable):
     """``y(t) = x(t - delay)``, interpolated linearly between samples.
@@ -41,7 +44,7 @@ class FractionalDelay(Fittable):
         bounds = Range(0.0, 5.0 * dt)
         if found is not None and extent.modes:
             # Errors of the hysteresis would bias the delay, as they would bias a mode.
-            off = NEAR * dt
+            off = (RAMP if extent.jump else NEAR) * dt
             bounds = Range(max(0.0, starts[0] - off), min(starts[0] + off, 5.0 * dt))
         return Recipe(
             cls(0.5 * dt, dt, 5),

@@ -6,14 +6,19 @@ import jax.numpy as jnp
 
 from ..core.arrays import Scalar, ScalarLike, as_array
 from ..core.parameter import parameter, sample_time
-from ..core.recipe import Extent, Fittable, Part, Recipe, scaled_range
+from ..core.recipe import Extent, Fittable, Part, Recipe
+from ..core.space import Range
 
 OFF = 0.8, 1.25
 """Bounds of a rate, as multiples of the one estimated from the record."""
 
 SHORTEST = 2.0
-"""For a record without a visible limit the fit starts from the rate that crosses the
-range of the input in this number of samples."""
+"""If the record shows no limit, the fit starts from the rate at which the largest of
+its few steps, or the range of the input, takes this number of samples."""
+
+UNSEEN = 0.1, 10.0
+"""Bounds of a rate, as multiples of that start. At the upper one this step takes a
+twentieth of a sample, which no record shows."""
 
 
 class AmplifierSlew(Fittable):
@@ -36,8 +41,10 @@ class AmplifierSlew(Fittable):
 
     @classmethod
     def recipe(cls, extent: Extent) -> Recipe:
-        rate = extent.slew or extent.width / (SHORTEST * extent.dt)
-        return Recipe(cls(rate, extent.dt), {"rate": scaled_range(rate, *OFF)})
+        rate = extent.slew or (extent.jump or extent.width) / (SHORTEST * extent.dt)
+        low, high = OFF if extent.slew else UNSEEN
+        bounds = Range(low * rate, high * rate, "log")
+        return Recipe(cls(rate, extent.dt), {"rate": bounds})
 
     def init(self, input: ScalarLike = 0.0) -> Scalar:
         return as_array(input)

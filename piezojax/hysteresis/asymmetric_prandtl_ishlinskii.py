@@ -10,6 +10,7 @@ from ..core.recipe import Extent, Fittable, Part, Recipe, rest_starts, scaled_ra
 from .inverse import Inverse, InverseHysteresis
 from .model import Hysteresis, Laws, turning_point_laws
 from .plays import (
+    FITTED_WEIGHTS,
     PLAYS,
     Memory,
     advance_plays,
@@ -93,6 +94,7 @@ class AsymmetricPrandtlIshlinskii(Hysteresis, Fittable):
             rest_starts(extent),
             gain="polynomial.0",
             own=("rest_input",),
+            vague=(*FITTED_WEIGHTS, *skews),
         )
 
     def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:

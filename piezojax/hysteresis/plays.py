@@ -19,6 +19,9 @@ ITERATIONS = 20
 PLAYS = 10
 """Operators of a fitted Prandtl-Ishlinskii model."""
 
+FITTED_WEIGHTS = tuple(f"weights.{i}" for i in range(PLAYS))
+"""Their weights."""
+
 
 def advance_plays(input: Scalar, memory: Memory, thresholds: Memory) -> Memory:
     """Advance play operators (backlashes) of half-width ``thresholds`` by one sample.
@@ -75,7 +78,7 @@ def plays_recipe(extent: Extent) -> tuple[dict[str, Any], dict[str, Range]]:
                 f"polynomial.{i}": scaled_range(s, -10.0, 10.0)
                 for i, s in enumerate(scales)
             },
-            **{f"weights.{i}": scaled_range(slope, 0.0, 1.0) for i in range(PLAYS)},
+            **{path: scaled_range(slope, 0.0, 1.0) for path in FITTED_WEIGHTS},
             **rest_bounds(extent),
         },
     )

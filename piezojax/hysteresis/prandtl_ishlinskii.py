@@ -8,6 +8,7 @@ from ..core.recipe import Extent, Fittable, Part, Recipe, rest_starts
 from .inverse import Inverse, check_rising
 from .model import Hysteresis, Laws, turning_point_laws
 from .plays import (
+    FITTED_WEIGHTS,
     Memory,
     advance_plays,
     check_invertible,
@@ -72,6 +73,7 @@ class PrandtlIshlinskii(Hysteresis, Fittable):
             rest_starts(extent),
             gain="polynomial.0",
             own=("rest_input",),
+            vague=FITTED_WEIGHTS,
         )
 
     def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:

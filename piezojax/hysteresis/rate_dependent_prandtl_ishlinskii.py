@@ -11,6 +11,7 @@ from ..core.space import Range
 from .inverse import Inverse, check_rising
 from .model import STEP, Hysteresis, Laws
 from .plays import (
+    FITTED_WEIGHTS,
     Memory,
     advance_plays,
     check_invertible,
@@ -101,6 +102,7 @@ class RateDependentPrandtlIshlinskii(Hysteresis, Fittable):
             rest_starts(extent),
             gain="polynomial.0",
             own=("rest_input",),
+            vague=FITTED_WEIGHTS,
         )
 
     def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:

@@ -58,11 +58,14 @@ def automatic(
     With ``dynamics``, which are held, the chain has no other dynamics.
     """
     hysteresis = hysteresis_for([record, *beside], progress, dynamics)
-    return _chain_of(hysteresis, record, dynamics)
+    return _chain_of(hysteresis, [record, *beside], dynamics)
 
 
-def _chain_of(hysteresis: str, record: Record, dynamics: HeldDynamics | None) -> str:
-    behind = dynamics_parts(record) if dynamics is None else ""
+def _chain_of(
+    hysteresis: str, records: Sequence[Record], dynamics: HeldDynamics | None
+) -> str:
+    first, *beside = records
+    behind = dynamics_parts(first, beside) if dynamics is None else ""
     return "+".join(part for part in (hysteresis, CREEP, behind) if part)
 
 
@@ -140,14 +143,17 @@ def _error(
     them is returned. The error is infinite if a fit fails, or if the fitted hysteresis
     has no inverse over the range of the input, because controllers need the inverse.
     """
-    first = records[0]
-    shape = structure(_chain_of(name, first, dynamics), first, dynamics)
+    first, *beside = records
+    chain = _chain_of(name, records, dynamics)
+    shape = structure(chain, first, dynamics, beside=beside)
     squares = []
     for record in records:
         others = [other for other in records if other is not record]
         every = slice(0, record.samples)
         try:
-            system = output_error(shape, [record], every, steps=STEPS).system
+            system = output_error(
+                shape, [record], every, steps=STEPS, own_starts=bool(others)
+            ).system
             hystereses(system)[0].inverse(first.input.min(), first.input.max())
         except ValueError:
             return np.inf

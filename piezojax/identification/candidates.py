@@ -13,7 +13,7 @@ import numpy as np
 
 from ..core.recipe import Extent
 from ..core.registry import parts as known_parts
-from .chain import dynamics_parts, extent_of, is_dynamic, training_record
+from .chain import by_evidence, dynamics_parts, extent_of, is_dynamic
 from .estimators.estimate import Options
 from .estimators.model_preisach import (
     PLAIN,
@@ -89,8 +89,8 @@ def supported_parts(
             for name in creeps[:-1]
         ]
         creeps = [""]
-    training = training_record(records, train)
-    found, extent = excitation(records, train), extent_of(training)
+    training, *beside = by_evidence(records, train)
+    found, extent = excitation(records, train), extent_of(training, beside)
     if extent.modes:
         # The error of a free run does not tell whether the mode is needed: creep and
         # hysteresis dominate it.
@@ -98,7 +98,8 @@ def supported_parts(
             f"the training part shows a resonance at {extent.modes[0].frequency:.4g} Hz"
         )
         untried += [UntriedModel(name, without) for name in DYNAMICS]
-        return SupportedParts(tuple(creeps), (dynamics_parts(training),)), untried
+        shown = dynamics_parts(training, beside)
+        return SupportedParts(tuple(creeps), (shown,)), untried
     dynamics = []
     for name in DYNAMICS:
         needed = _parameter_count(name, extent)

@@ -13,7 +13,7 @@ from ..core.space import INSIDE, Range, Space, space_of
 from ..core.system import Affine, Series, System, series
 from ..hysteresis.model import Hysteresis
 from .estimators.resonances import LinearDynamics, linear_dynamics
-from .estimators.slew_rate import has_steps
+from .estimators.slew_rate import few_steps, has_steps
 from .estimators.structure import Structure
 from .held_dynamics import HeldDynamics
 from .records.record import Record
@@ -82,15 +82,19 @@ def by_evidence(records: Sequence[Record], train: slice) -> list[Record]:
     """Return the samples of each record up to the end of ``train``, sorted.
 
     Records with steps come first, because they show resonances and the slew rate best;
-    then those with the largest range. Models, bounds and starts must not depend on the
-    validation part.
+    then those that show the most resonances, then those with the largest range. Models,
+    bounds and starts must not depend on the validation part.
     """
-
-    def shows(record: Record) -> tuple[bool, float]:
-        single = record.inputs.shape[1] == 1
-        return single and has_steps(record.input), record.span
-
     parts = [record.until(train.stop) for record in records]
+    if len(parts) == 1:
+        return parts
+
+    def shows(record: Record) -> tuple[bool, int, float]:
+        if (record.inputs.shape[1], record.outputs.shape[1]) != (1, 1):
+            return False, 0, record.span
+        modes = dynamics_of(record).modes
+        return has_steps(record.input), len(modes), record.span
+
     return sorted(parts, key=shows, reverse=True)
 
 
@@ -107,21 +111,40 @@ def shown_dynamics(records: Sequence[Record], train: slice) -> LinearDynamics:
     return dynamics_of(training_record(records, train))
 
 
-def dynamics_parts(record: Record) -> str:
-    """Return the chain of linear dynamics that ``record`` shows, a lag if none."""
+def dynamics_parts(record: Record, beside: Sequence[Record] = ()) -> str:
+    """Return the chain of linear dynamics that ``record`` shows, a lag if none.
+
+    A slew rate is among them if the record shows one. Delay and slew rate are if this
+    record or those ``beside`` it have steps that are too few to tell them apart.
+    """
     shown = dynamics_of(record)
     if not shown.modes:
         return "lag"
     late = shown.delay is not None and shown.delay > FRACTION * record.dt
+    unclear = _unclear_step(record, beside) > 0.0
     alone = len(shown.modes) == 1 and not shown.lags
     found = ["mode" if alone else "modes"]
-    return "+".join(found + ["delay"] * late + ["slew"] * (shown.slew is not None))
+    found += ["delay"] * (late or unclear)
+    return "+".join(found + ["slew"] * (shown.slew is not None or unclear))
 
 
-def extent_of(record: Record, reach: float = 1.0) -> Extent:
+def _unclear_step(record: Record, beside: Sequence[Record]) -> float:
+    """Return the largest step (V) whose ramp may be in the delay of ``record``, or 0.
+
+    A record with many steps, which comes first (``by_evidence``), shows the slew rate.
+    """
+    if has_steps(record.input):
+        return 0.0
+    return max(few_steps(each.input) for each in (record, *beside))
+
+
+def extent_of(
+    record: Record, beside: Sequence[Record] = (), reach: float = 1.0
+) -> Extent:
     """Return the ranges of a record with one input and one output, and its dynamics.
 
-    ``reach`` is that of Extent.
+    The range of the input is that of all records, with those ``beside`` it. ``reach``
+    is that of Extent.
     """
     x, y = record.input, record.output
     shown, span = dynamics_of(record), record.span
@@ -130,8 +153,8 @@ def extent_of(record: Record, reach: float = 1.0) -> Extent:
         # Beside a resonance the range of the output says little about the slope.
         slope, span = shown.slope, abs(shown.slope) * float(np.ptp(x))
     return Extent(
-        low=float(x.min()),
-        high=float(x.max()),
+        low=min(float(each.input.min()) for each in (record, *beside)),
+        high=max(float(each.input.max()) for each in (record, *beside)),
         first=(float(x[0]), float(y[0])),
         slope=slope,
         centre=float(np.mean(y) - slope * np.mean(x)),
@@ -142,6 +165,7 @@ def extent_of(record: Record, reach: float = 1.0) -> Extent:
         lags=shown.lags,
         delay=shown.delay,
         slew=shown.slew,
+        jump=0.0 if shown.slew else _unclear_step(record, beside),
         reach=reach,
     )
 
@@ -168,15 +192,16 @@ def structure(
     record: Record,
     dynamics: HeldDynamics | None = None,
     *,
+    beside: Sequence[Record] = (),
     reach: float = 1.0,
 ) -> Structure:
     """Return the chain ``name`` with starts and bounds derived from ``record``.
 
-    An offset of the output is always added. With ``dynamics``, which are held, the
-    chain has no other dynamics. ``reach`` is that of Extent. Raises ValueError as for
-    ``chain`` and ``slow_chain``.
+    They hold for the input of the records ``beside`` it too. An offset of the output is
+    always added. With ``dynamics``, which are held, the chain has no other dynamics.
+    ``reach`` is that of Extent. Raises ValueError as for ``chain`` and ``slow_chain``.
     """
-    extent, shown = extent_of(record, reach), dynamics_of(record)
+    extent, shown = extent_of(record, beside, reach), dynamics_of(record)
     known = known_parts()
     names = slow_chain(name, dynamics.source) if dynamics else chain(name)
     kinds = [known[part] for part in names]
@@ -210,7 +235,10 @@ def structure(
         if f"{place}.{path}" not in gains[:-1]
     }
     space = space_of(bounds)
-    own = [f"{place}.{path}" for place, part in parts.items() for path in part.own]
+
+    def of_parts(kind: str) -> tuple[str, ...]:
+        every = ((place, getattr(part, kind)) for place, part in parts.items())
+        return tuple(f"{place}.{path}" for place, paths in every for path in paths)
 
     def within(places: Sequence[str]) -> tuple[str, ...]:
         return tuple(path for path in bounds if path.split(".")[0] in places)
@@ -219,9 +247,10 @@ def structure(
         system,
         space,
         _starts(system, space, parts),
-        own=(*own, OFFSET),
+        own=(*of_parts("own"), OFFSET),
         dynamics=within(LINEAR),
         slow=within(SLOW),
+        vague=of_parts("vague"),
         whitening=shown.whitening if shown.modes and dynamics is None else (),
     )
 

@@ -11,7 +11,7 @@ from ..core.paths import get, parameters, replace
 from ..core.progress import Progress
 from ..core.system import Affine, series
 from ..hysteresis.model import hystereses
-from .chain import OFFSET, structure, training_record
+from .chain import OFFSET, by_evidence, structure
 from .closed_loop import LoopFit, is_closed, loop_fit
 from .estimators.estimate import Estimate, FittedParameter, Options, bound_warning
 from .estimators.free_runs import free_runs
@@ -57,7 +57,8 @@ def _by_output_error(
             shape = options.known.structure(records)
             text = is_closed(records, options) * FITTED_AGAIN
         else:
-            shape = structure(model, training_record(records, train), options.dynamics)
+            first, *beside = by_evidence(records, train)
+            shape = structure(model, first, options.dynamics, beside=beside)
         optimum = output_error(
             shape,
             records,

@@ -9,7 +9,14 @@ from piezojax.control.design_model import design_model
 from piezojax.core.system import Affine, series
 from piezojax.dynamics import AmplifierSlew, FirstOrderLag
 from piezojax.hysteresis import PrandtlIshlinskii
-from piezojax.identification.chain import dynamics_of, dynamics_parts, structure
+from piezojax.identification.chain import (
+    by_evidence,
+    dynamics_of,
+    dynamics_parts,
+    extent_of,
+    structure,
+)
+from piezojax.identification.estimators.slew_rate import few_steps
 
 DT, RATE = 1e-4, 1e5
 FINE = 1000
@@ -71,6 +78,57 @@ def test_a_record_with_steps_shows_slew_rate_and_mode():
 
 def test_a_fast_amplifier_shows_no_slew_rate():
     assert dynamics_of(Record(STEPS, stage(STEPS, None), DT)).slew is None
+
+
+SINE = 50.0 + 30.0 * np.sin(2.0 * np.pi * 20.0 * DT * np.arange(2000))
+
+
+@pytest.mark.parametrize(
+    ("input", "expected"),
+    [
+        (SINE, 0.0),
+        (np.concatenate([np.full(200, 38.0), SINE]), 12.0),
+        # A step in the middle of a fast motion.
+        (SINE + 25.0 * (np.arange(2000) > 700), 25.0),
+        (np.repeat([0.0, 80.0, 20.0], 300), 80.0),
+        (STEPS, 0.0),  # enough of them for a search
+        (np.random.default_rng(3).uniform(0.0, 100.0, 500), 0.0),
+        (np.full(100, 5.0), 0.0),
+    ],
+)
+def test_steps_too_few_to_show_a_slew_rate(input, expected):
+    assert few_steps(input) == pytest.approx(expected, abs=1.0)
+
+
+def test_a_single_step_leaves_delay_and_slew_rate_free():
+    u = np.concatenate([np.full(300, 38.0), SINE])
+    record = Record(u, stage(u, 4e4), DT)
+    shown = dynamics_of(record)
+    assert shown.slew is None
+    assert dynamics_parts(record) == "mode+delay+slew"
+    shape = structure(f"prandtl_ishlinskii+{dynamics_parts(record)}", record)
+    ranges = shape.space.ranges()
+    rate, delay = ranges["drive.rate"], ranges["delay.delay"]
+    assert rate.lower < 4e4 < rate.upper
+    # The ramp of 12 V takes 3 samples: its mean is not in the delay of a record of
+    # steps, but in that of this one.
+    assert delay.lower <= max(0.0, shown.delay - 2.0 * DT) + 1e-12
+    assert delay.upper >= shown.delay + 2.0 * DT - 1e-12
+
+
+def test_a_record_beside_it_tells_that_a_slew_rate_may_be_hidden():
+    moving = Record(SINE, stage(SINE, 4e4), DT)
+    wide = np.concatenate([np.full(300, 25.0), 50.0 + 1.5 * (SINE - 50.0)])
+    stepped = Record(wide, stage(wide, 4e4), DT)
+    assert "slew" not in dynamics_parts(moving)
+    first, *beside = by_evidence([moving, stepped], slice(0, wide.size))
+    # The sine alone shows no resonance.
+    assert first.input.size == wide.size
+    assert dynamics_parts(first, beside).endswith("delay+slew")
+    assert extent_of(moving, [stepped]).jump == pytest.approx(25.0)
+    assert extent_of(moving, [stepped]).high == pytest.approx(95.0, abs=0.1)
+    shape = structure("prandtl_ishlinskii+lag", moving, beside=[stepped])
+    assert shape.system.parts[0].thresholds[-1] == pytest.approx(45.0 * 10 / 11, 0.01)
 
 
 def test_a_design_leaves_the_slew_limit_out():

@@ -99,7 +99,8 @@ def test_dynamics_without_a_shown_resonance_are_not_tried():
     output = scipy.signal.lfilter(b[0], a, input)
     output += 1e-3 * np.random.default_rng(0).standard_normal(2000)
     behind, untried = supported_parts([Record(input, output, dt)], HALF)
-    assert behind.dynamics == ("mode",)
+    # A single step does not tell a delay from the ramp of a slew rate.
+    assert behind.dynamics == ("mode+delay+slew",)
     assert set(reasons(untried)) == {"arma", "lag"}
     for reason in reasons(untried).values():
         assert reason == "the training part shows a resonance at 60 Hz"

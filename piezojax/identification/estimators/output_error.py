@@ -26,7 +26,7 @@ from ..records.record import Record
 from .error_problem import Problem, at_starts, problem_of
 from .free_runs import starts_of
 from .noise_model import NOISE_ORDER
-from .structure import Structure
+from .structure import Prior, Structure
 
 PARALLEL_STARTS = 4
 """Number of starts that descend together in one program."""
@@ -39,6 +39,11 @@ ROUGH_STEPS = 24
 
 PASSES = 3
 """Number of searches for the starts of several records, each followed by a fit."""
+
+CAUTION = 0.02
+"""Standard deviation of a vague parameter around the first start, as a share of its
+bounds. Two records may not determine each weight of a hysteresis: a third record, with
+another history, then has errors many times as large."""
 
 NOISE_PASSES = 4
 """Largest number of alternate fits of a noise model and the parameters."""
@@ -122,7 +127,8 @@ def output_error(
     counts over the samples ``train`` of each record; the model sees the input alone,
     from the first sample on. With several records, or with ``own_starts``, the state
     before each record and its zero are estimated in place of the structure's ``own``
-    parameters.
+    parameters, and the ``vague`` parameters are held near the first start with the
+    weight of one independent sample in ``CAUTION`` of their range.
 
     With a ``noise_model`` the error is that of the prediction by the model and an
     autoregressive model of its errors, which are fitted alternately (Ljung, System
@@ -152,6 +158,10 @@ def output_error(
         restarted = [path in slow for path in structure.space.paths]
         starts = np.where(restarted, starts[:1], best)
     problem = problem_of(structure, records, train, drives)
+    cautious = several and bool(structure.vague) and not noise_model
+    none = prior = Prior(*np.zeros((2, starts.shape[1])))
+    if cautious:
+        problem = _with_prior(problem, none)  # of the final size, to compile once
     if noise_model:
         idle = jnp.zeros(NOISE_ORDER + 1)  # of the final size, to compile once
         problem = eqx.tree_at(lambda p: p.whitening, problem, idle)
@@ -166,6 +176,9 @@ def output_error(
             system = problem.space.put(problem.system, as_array(units[0]))
             found, *_ = starts_of(system, records, train)
             problem = at_starts(problem, found)
+        if cautious and left < rounds - 1:
+            prior = _lighter(prior, _first_guess(structure, problem, units[0]))
+            problem = _with_prior(problem, prior)
         last = not left and not whitened
         units, losses, finished = _descended(
             problem, _inside(units), width, steps if last else rough, progress
@@ -189,7 +202,43 @@ def output_error(
         if abs(before - losses[0]) <= NOISE_SETTLED * losses[0]:
             break
         before = losses[0]
+    if cautious:
+        problem = _with_prior(problem, none)  # errors are those of the records alone
     return Optimum(problem, units, losses, finished)
+
+
+def _with_prior(problem: Problem, prior: Prior) -> Problem:
+    return eqx.tree_at(lambda p: p.prior, problem, as_array(np.stack(prior)))
+
+
+def _lighter(prior: Prior, later: Prior) -> Prior:
+    """Return ``later``, with at most the weights of ``prior`` if this has any.
+
+    A prior that is too heavy raises the errors, and these must not make it heavier.
+    """
+    if not prior.weights.any():
+        return later
+    return later._replace(weights=np.minimum(prior.weights, later.weights))
+
+
+def _first_guess(structure: Structure, problem: Problem, unit: np.ndarray) -> Prior:
+    """Return the prior of the vague parameters around the first start.
+
+    The errors at ``unit`` are mostly those of the model, not white noise: the number of
+    independent ones is the participation ratio of their spectrum.
+    """
+    errors = np.asarray(problem.errors(as_array(unit)))
+    counted = np.asarray(problem.weights) > 0.0
+    powers = [
+        np.abs(np.fft.rfft(error[used])) ** 2
+        for error, used in zip(errors, counted, strict=True)
+    ]
+    independent = sum(2.0 * np.sum(p) ** 2 / np.sum(p**2) for p in powers)
+    rms = float(np.sqrt(np.mean(errors[counted] ** 2)))
+    vague = np.array([path in structure.vague for path in structure.space.paths])
+    return Prior(
+        structure.starts[0], vague * rms / (CAUTION * float(np.sqrt(independent)))
+    )
 
 
 def _inside(units: np.ndarray) -> np.ndarray:

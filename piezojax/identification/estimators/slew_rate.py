@@ -8,6 +8,10 @@ JUMP, STEPS, RARE = 0.05, 5, 0.02
 """Change of the input in a sample, as a share of its range, that is a step; fewest
 steps that show a slew rate, and largest share of samples with a step."""
 
+ALONE = 3.0
+"""Ratio of a step to the changes beside it, of an input that moves between its steps.
+"""
+
 SAMPLES = tuple(np.geomspace(0.75, 75.0, 12))
 """Durations tried for the largest step at the slew rate, in samples."""
 
@@ -22,6 +26,19 @@ def has_steps(x: np.ndarray) -> bool:
     """Return whether ``x`` [samples] has several steps and is slow between them."""
     jumps = np.abs(np.diff(x)) > JUMP * np.ptp(x)
     return int(np.sum(jumps)) >= STEPS and bool(np.mean(jumps) < RARE)
+
+
+def few_steps(x: np.ndarray) -> float:
+    """Return the largest step of ``x`` if it has steps too few to show a slew rate.
+
+    It is 0 for other inputs. A single ramp at the slew rate looks like a delay. A step
+    is larger than the changes before and after it by the factor ``ALONE``.
+    """
+    changes = np.abs(np.diff(x, prepend=x[0], append=x[-1]))
+    beside = np.maximum(changes[:-2], changes[2:])
+    inner = changes[1:-1]
+    steps = inner[(inner > JUMP * np.ptp(x)) & (inner > ALONE * beside)]
+    return float(np.max(steps)) if 0 < steps.size < STEPS else 0.0
 
 
 def slewed(x: np.ndarray, most: float) -> np.ndarray:

@@ -24,8 +24,9 @@ class Structure(NamedTuple):
     """A model to fit: its System, the box of its parameters, starts in the box.
 
     ``own`` holds the paths of the state before a record and of the sensor's zero, which
-    differ from record to record. ``dynamics`` holds the paths of linear dynamics, and
-    ``slow`` those of creep, which a short record does not determine.
+    differ from record to record. ``dynamics`` holds the paths of linear dynamics,
+    ``slow`` those of creep, which a short record does not determine, and ``vague``
+    those of the terms of a sum, as in Recipe.
     ``whitening`` holds the coefficients of a filter that turns the errors into white
     noise; if it has any, the filtered errors count as much as the errors themselves,
     which are largest at low frequencies. ``prior`` is that of the parameters, if any.
@@ -38,6 +39,7 @@ class Structure(NamedTuple):
     own: tuple[str, ...] = ()
     dynamics: tuple[str, ...] = ()
     slow: tuple[str, ...] = ()
+    vague: tuple[str, ...] = ()
     whitening: tuple[float, ...] = ()
     prior: Prior | None = None
     weights: tuple[float, ...] = ()

@@ -1,0 +1,120 @@
+"""Fits of several records hold parameters that these do not determine."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles import hysteresis as oracle
+
+from piezojax import Record
+from piezojax.identification.chain import structure
+from piezojax.identification.estimators import output_error as fits
+from piezojax.identification.estimators.error_problem import at_starts, problem_of
+from piezojax.identification.estimators.free_runs import starts_of
+from piezojax.identification.estimators.structure import Prior
+
+DT, SAMPLES, NOISE = 1e-3, 400, 2e-3
+MODEL = "prandtl_ishlinskii+exponential_creep+lag"
+VAGUE = [*(f"hysteresis.weights.{i}" for i in range(10))]
+VAGUE += [f"creep.gains.{i}" for i in range(4)]
+
+
+def response(u):
+    """Return the motion of four plays without creep, from rest at 50 V."""
+    motion = 0.08 * u
+    for threshold, weight in ((5.0, 0.01), (12.0, 0.004), (25.0, 0.012), (40.0, 0.006)):
+        motion = motion + weight * oracle.play(u, threshold, 50.0)
+    return np.append(motion[0], motion[:-1])  # a voltage acts on the next sample
+
+
+def record_of(height, seed):
+    """Return the record of a swing over the range and small cycles after it."""
+    time = DT * np.arange(SAMPLES)
+    u = 50.0 + height * np.sin(2.0 * np.pi * 8.0 * time)
+    u[:100] = 50.0 + 45.0 * np.sin(2.0 * np.pi * 10.0 * time[:100])
+    noise = NOISE * np.random.default_rng(seed).standard_normal(SAMPLES)
+    return Record(u, response(u) + noise, DT, source=f"{height} V")
+
+
+@pytest.fixture(scope="module")
+def records():
+    return [record_of(8.0, 1), record_of(14.0, 2)]
+
+
+@pytest.fixture(scope="module")
+def shape(records):
+    return structure(MODEL, records[0], beside=records[1:])
+
+
+def test_the_terms_of_sums_are_vague(shape):
+    assert list(shape.vague) == VAGUE
+    assert structure("coleman_hodgdon+lag", record_of(8.0, 1)).vague == ()
+
+
+def problem_at_first_guess(shape, records):
+    part, fitted = slice(0, SAMPLES), shape.without(shape.own)
+    problem = problem_of(fitted, records, part)
+    system = problem.space.put(problem.system, jnp.asarray(fitted.starts[0]))
+    return fitted, at_starts(problem, starts_of(system, records, part)[0])
+
+
+def test_the_weight_is_that_of_one_independent_sample(shape, records, monkeypatch):
+    fitted, problem = problem_at_first_guess(shape, records)
+    time = np.arange(SAMPLES)
+    sines = np.stack([0.3 * np.sin(2.0 * np.pi * k * time / SAMPLES) for k in (3, 50)])
+    monkeypatch.setattr(type(problem), "errors", lambda self, unit: sines)
+    found = fits._first_guess(fitted, problem, fitted.starts[0])
+    np.testing.assert_array_equal(found.known, fitted.starts[0])
+    # A sine has one line: two independent numbers, its sine and its cosine.
+    rms, independent = 0.3 / np.sqrt(2.0), 2 * 2
+    expected = rms / (0.02 * np.sqrt(independent))
+    held = [path in VAGUE for path in fitted.space.paths]
+    np.testing.assert_allclose(found.weights[held], expected)
+    assert not found.weights[np.logical_not(held)].any()
+    white = np.random.default_rng(0).standard_normal((2, SAMPLES))
+    monkeypatch.setattr(type(problem), "errors", lambda self, unit: white)
+    found = fits._first_guess(fitted, problem, fitted.starts[0])
+    # The lines of white noise differ by chance: half as many count.
+    assert found.weights.max() == pytest.approx(
+        1.0 / (0.02 * np.sqrt(SAMPLES)), rel=0.1
+    )
+
+
+def test_a_prior_never_grows():
+    first, later = (Prior(np.zeros(2), np.array(w)) for w in ([3.0, 0.0], [5.0, 0.0]))
+    none = Prior(*np.zeros((2, 2)))
+    np.testing.assert_array_equal(fits._lighter(none, later).weights, later.weights)
+    np.testing.assert_array_equal(fits._lighter(first, later).weights, first.weights)
+    np.testing.assert_array_equal(fits._lighter(later, first).weights, first.weights)
+
+
+@pytest.fixture(scope="module")
+def optimum(shape, records):
+    return fits.output_error(shape, records, slice(0, SAMPLES), steps=40)
+
+
+def distance(optimum, shape):
+    """Return the largest distance of a creep gain from its first guess, in the box."""
+    fitted = shape.without(shape.own)
+    gains = [path in VAGUE[-4:] for path in fitted.space.paths]
+    return np.abs(optimum.units[0] - fitted.starts[0])[gains].max()
+
+
+def test_gains_of_creep_that_is_not_seen_stay_near_the_first_guess(
+    optimum, shape, records
+):
+    free = fits.output_error(
+        shape._replace(vague=()), records, slice(0, SAMPLES), steps=40
+    )
+    assert 5.0 * distance(optimum, shape) < distance(free, shape)
+    assert optimum.losses[0] < 1.2 * free.losses[0]
+
+
+def test_the_errors_are_those_of_the_records_alone(optimum):
+    assert not np.asarray(optimum.problem.prior).any()
+    _, errors = fits.values_and_errors(optimum)
+    paths = optimum.problem.space.paths
+    found = dict(zip(paths, errors, strict=True))
+    # Without the prior the records tell less than it assumes about some gains.
+    widths = np.asarray(optimum.problem.space.upper - optimum.problem.space.lower)
+    assumed = 0.02 * widths[paths.index("creep.gains.3")]
+    assert found["creep.gains.3"] is None or found["creep.gains.3"] > assumed
