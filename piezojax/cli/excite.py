@@ -67,7 +67,7 @@ def main(results, duration, points, out, seed, quiet, **limits):
     With RESULTS, a folder of tune with a fitted plant, the voltages are designed for
     this plant and these gains: they make the errors of the promised figures small that
     the errors of the plant cause. Limits and rate are those of its study by default.
-    Ctrl-C ends the search for a half of the record, and keeps the best one so far.
+    Ctrl-C ends their search, and keeps the best ones so far.
     """
 
     def body(console):

@@ -121,9 +121,10 @@ def next_record(
     are its tracking errors for the references of ``case``, and its limited
     margins; the sum of their relative variances is minimised. The plant must have been
     fitted. Voltages begin and end at the middle of the range, and stay within the
-    limits of ``generator``. Raises ValueError for a study with several axes, an
-    amplifier or a sensor without noise, for a plant that was not fitted, for another
-    rate than the study's, and for too few samples.
+    limits of ``generator``. Ctrl-C ends the search: its half keeps the best record so
+    far, and a half that was not begun is the best random one. Raises ValueError for a
+    study with several axes, an amplifier or a sensor without noise, for a plant that
+    was not fitted, for another rate than the study's, and for too few samples.
     """
     progress = progress or Silent()
     progress.stage("differentiating the promised figures")
@@ -140,12 +141,15 @@ def next_record(
         rms = 100.0 * np.exp(loss) / np.sqrt(len(task.figures))
         progress.advance(rms, f"standard error {rms:.3g} %")
 
-    fit, validate = (
-        best_voltages(
-            task.search, generator, descents, np.random.default_rng([seed, half]), show
+    interrupted, halves = False, []
+    for half, descents in enumerate(DESCENTS):
+        random = np.random.default_rng([seed, half])
+        found, ended = best_voltages(
+            task.search, generator, 0 if interrupted else descents, random, show
         )
-        for half, descents in enumerate(DESCENTS)
-    )
+        interrupted = interrupted or ended
+        halves.append(found)
+    fit, validate = halves
     progress.stage("comparing with the usual record")
     usual = np.concatenate([part.voltages for part in excitation(generator, seed)[0]])
     report = _report(case, task, fit, usual)

@@ -2,6 +2,7 @@
 
 from collections import abc
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -125,7 +126,14 @@ def point_of(loss: Array, moves: np.ndarray) -> Point:
 
 def report_count(descents: int) -> int:
     """Return the number of reports of ``best_voltages``."""
-    return TRIALS + descents * ROUGH + FINE
+    return TRIALS + descents * ROUGH + (FINE if descents else 0)
+
+
+class Designed(NamedTuple):
+    """Voltages (V) of the least loss that a search found, and whether it was ended."""
+
+    voltages: Float[np.ndarray, " samples"]
+    interrupted: bool
 
 
 def best_voltages(
@@ -134,15 +142,16 @@ def best_voltages(
     descents: int,
     random: np.random.Generator,
     report: abc.Callable[[float], None],
-) -> Float[np.ndarray, " samples"]:
-    """Return the voltages (V) of the least loss that is found.
+) -> Designed:
+    """Search for the voltages of the least loss.
 
     Descents begin at the best ``descents`` of ``TRIALS`` random records; the best of
-    them continues. ``report`` is called with the least loss so far after each record
-    and each step. Ctrl-C ends the search with the best record so far. Raises ValueError
-    if no random record has a finite loss.
+    them continues. Without descents it is the best random record. ``report`` is called
+    with the least loss so far after each record and each step. Ctrl-C ends the search
+    with the best record so far. Raises ValueError if no random record has a finite
+    loss.
     """
-    best = Point(np.inf, np.zeros(search.knots))
+    best, interrupted = Point(np.inf, np.zeros(search.knots)), False
     try:
         for point in _points(search, generator, descents, random):
             best = min(best, point)
@@ -150,7 +159,8 @@ def best_voltages(
     except KeyboardInterrupt:
         if best.loss == np.inf:
             raise
-    return np.asarray(search.voltages(as_array(best.moves)))
+        interrupted = True
+    return Designed(np.asarray(search.voltages(as_array(best.moves))), interrupted)
 
 
 def _points(
@@ -174,7 +184,8 @@ def _points(
     rough = []
     for start in sorted(points)[:descents]:
         rough.append((yield from _descent(search, start, ROUGH)))
-    yield from _descent(search, min(rough), FINE)
+    if rough:
+        yield from _descent(search, min(rough), FINE)
 
 
 def _descent(

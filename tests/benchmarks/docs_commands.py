@@ -306,6 +306,12 @@ def export(folder, page):
     (folder / "saved.ini").write_text(saved, encoding="utf-8")
 
 
+def recording(folder, page):
+    """Tune gains for a first record."""
+    write_record(folder / "first.csv", 10_000.0)
+    shell("python -m piezojax.start first.csv --yes --out results/first", folder)
+
+
 def sweeps(folder, page):
     shutil.copy(ROOT / "tuning/sweep_p753.toml", folder / "study.toml")
 
@@ -317,7 +323,7 @@ def trial(folder, page):
 
 INPUTS = {
     make.__name__: make
-    for make in (start, devices, identification, export, sweeps, trial)
+    for make in (start, devices, identification, export, recording, sweeps, trial)
 }
 """Functions by the name of a page that make its inputs in a folder, from its text."""
 

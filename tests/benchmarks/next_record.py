@@ -151,7 +151,7 @@ def lines_of(case, loop, arguments, paths=None):
     unknowns = unknowns_at(case, paths) if paths else unknowns_of(case)
     task = make_task(case, loop, generator, samples, unknowns)
     silent = lambda loss: None  # noqa: E731
-    design = best_voltages(task.search, generator, DESCENTS[0], random, silent)
+    design, _ = best_voltages(task.search, generator, DESCENTS[0], random, silent)
     best = {"designed": ("", design)}
     for kind, name, voltages in others(generator, samples, random):
         error = rms(task.errors(voltages)[0])

@@ -18,6 +18,7 @@ from study_tables import with_values
 
 import piezojax as pj
 from piezojax.core.feedback import loop_inputs
+from piezojax.core.progress import Silent
 from piezojax.core.rollout import simulate
 from piezojax.identification.records.sampled import read_sampled
 from piezojax.signals.excitation import Generator, mixture, two_levels
@@ -100,9 +101,10 @@ def task(case):
 @pytest.fixture(scope="module")
 def designed(task):
     random = np.random.default_rng(0)
-    return record_search.best_voltages(
+    found = record_search.best_voltages(
         task.search, GENERATOR, 4, random, lambda loss: None
     )
+    return found.voltages
 
 
 def numpy_output(values, voltages):
@@ -247,7 +249,8 @@ def test_a_descent_reports_the_least_loss_and_returns_it(task, monkeypatch):
     )
     assert len(losses) == record_search.report_count(2) == 4 + 2 * 5 + 8
     assert losses[-1] == min(losses) < losses[3]
-    loss = task.search.loss(jnp.asarray(task.search.moves(found)))
+    assert not found.interrupted
+    loss = task.search.loss(jnp.asarray(task.search.moves(found.voltages)))
     assert float(loss) == pytest.approx(losses[-1], abs=1e-6)
 
 
@@ -263,8 +266,28 @@ def test_an_interrupted_search_returns_the_best_record_so_far(task):
         task.search, GENERATOR, 2, np.random.default_rng(0), interrupted
     )
     assert len(losses) == 7
-    loss = task.search.loss(jnp.asarray(task.search.moves(found)))
+    assert found.interrupted
+    loss = task.search.loss(jnp.asarray(task.search.moves(found.voltages)))
     assert float(loss) == pytest.approx(losses[-1], abs=1e-6)
+
+
+def test_an_interrupted_design_does_not_begin_another_search(case, monkeypatch):
+    monkeypatch.setattr(record_search, "TRIALS", 3)
+
+    class Interrupting(Silent):
+        steps = 0
+
+        def advance(self, best, note=""):
+            self.steps += 1
+            if self.steps == 5:
+                raise KeyboardInterrupt
+
+    progress = Interrupting()
+    found = next_record(case, case.loop, GENERATOR, 200, progress=progress)
+    # The second half is the best of its random records.
+    assert progress.steps == 5 + record_search.report_count(0) == 5 + 3
+    assert 0 < found.validate.size <= 200
+    assert found.report.figures
 
 
 def test_an_interruption_before_the_first_record_ends_the_design(task, monkeypatch):
