@@ -135,8 +135,10 @@ def _read(
         "--segment": options.segment is not None,
     }
     if named := [name for name, given in of_records.items() if given]:
+        needs = "needs" if len(named) == 1 else "need"
         raise ValueError(
-            f"{', '.join(named)} need a --method: the RECORD is then a record over time"
+            f"{', '.join(named)} {needs} a --method: the RECORD is then a record over "
+            "time"
         )
     responses = [
         response

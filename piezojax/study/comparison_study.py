@@ -43,6 +43,11 @@ class RateRange(RangeTable):
         both = self.lower is not None and self.upper is not None
         if both == (self.factor is not None):
             raise ValueError("give lower and upper, or a factor")
+        if self.factor is not None and self.per_sample:
+            raise ValueError(
+                "per_sample multiplies lower and upper by the rate; a factor has no "
+                "unit: leave per_sample out"
+            )
         if self.factor is not None and self.scale not in (None, "log"):
             raise ValueError(
                 f"scale is {self.scale!r}; bounds of a factor are searched on the "

@@ -128,7 +128,7 @@ def test_a_multisine_becomes_a_model_and_a_file_that_is_read(tmp_path, monkeypat
     ("line", "message"),
     [
         ("r.csv --skip 2 --unit nm/V", "--unit, --skip need --response"),
-        ("r.csv --response --period 9 --rate 9", "--period need a --method"),
+        ("r.csv --response --period 9 --rate 9", "--period needs a --method"),
         (
             "r.csv --response --rate 9 --segment 64 --skip 2",
             "--skip, --segment need a --method",

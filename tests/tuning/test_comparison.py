@@ -299,6 +299,10 @@ def test_bad_controllers(changes, message):
             {"bounds": {"*": {"factor": 9.0, "scale": "linear"}}},
             "scale is 'linear'; bounds of a factor are searched on the scale 'log'",
         ),
+        (
+            {"bounds": {"*": {"factor": 9.0, "per_sample": True}}},
+            "a factor has no unit: leave per_sample out",
+        ),
         ({"controllers": {"pid": {"label": "PID"}}}, "controllers.pid.catalog is miss"),
         (
             {"controllers": {"pid": {**FILE["controllers"]["pid"], "catalogue": "x"}}},
