@@ -127,8 +127,8 @@ def output_error(
     counts over the samples ``train`` of each record; the model sees the input alone,
     from the first sample on. With several records, or with ``own_starts``, the state
     before each record and its zero are estimated in place of the structure's ``own``
-    parameters, and the ``vague`` parameters are held near the first start with the
-    weight of one independent sample in ``CAUTION`` of their range.
+    parameters, and the ``vague`` parameters have a weak prior at the first start; its
+    scale follows from the errors of a first fit without it.
 
     With a ``noise_model`` the error is that of the prediction by the model and an
     autoregressive model of its errors, which are fitted alternately (Ljung, System
