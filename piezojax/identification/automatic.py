@@ -57,8 +57,8 @@ def automatic(
     rate if it resolves the resonances and the input.
     With ``dynamics``, which are held, the chain has no other dynamics.
     """
-    hysteresis = hysteresis_for([record, *beside], progress, dynamics)
-    return _chain_of(hysteresis, [record, *beside], dynamics)
+    records = [record, *beside]
+    return _chain_of(hysteresis_for(records, progress, dynamics), records, dynamics)
 
 
 def _chain_of(

@@ -133,7 +133,7 @@ def _unclear_step(record: Record, beside: Sequence[Record]) -> float:
 
     A record with many steps, which comes first (``by_evidence``), shows the slew rate.
     """
-    if has_steps(record.input):
+    if has_steps(record.input) or dynamics_of(record).slew is not None:
         return 0.0
     return max(few_steps(each.input) for each in (record, *beside))
 
@@ -165,7 +165,7 @@ def extent_of(
         lags=shown.lags,
         delay=shown.delay,
         slew=shown.slew,
-        jump=0.0 if shown.slew else _unclear_step(record, beside),
+        jump=_unclear_step(record, beside),
         reach=reach,
     )
 

@@ -119,7 +119,7 @@ class Point:
     moves: np.ndarray = field(compare=False)
 
 
-def point_of(loss: Array, moves: np.ndarray) -> Point:
+def _point(loss: Array, moves: np.ndarray) -> Point:
     """Return the point at ``moves``, the worst of all if its loss is not finite."""
     return Point(float(loss) if np.isfinite(loss) else np.inf, moves)
 
@@ -174,7 +174,7 @@ def _points(
     for trial in range(TRIALS):
         drawn = (mixture, two_levels)[trial % 2]
         moves = search.moves(drawn(generator, search.samples, random))
-        points.append(point_of(_loss(search, as_array(moves)), moves))
+        points.append(_point(_loss(search, as_array(moves)), moves))
         yield points[-1]
     if min(points).loss == np.inf:
         raise ValueError(
@@ -202,7 +202,7 @@ def _descent(
     shares = 0.5 + 0.5 * np.cos(np.linspace(0.0, np.pi, steps))
     for size in SMALLEST + (LARGEST - SMALLEST) * shares:
         loss, moved, direction = _stepped(search, moves, direction, as_array(size))
-        point = point_of(loss, np.asarray(moves))
+        point = _point(loss, np.asarray(moves))
         best, moves = min(best, point), moved
         yield point
     return best
