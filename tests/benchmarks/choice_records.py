@@ -147,6 +147,13 @@ TRUTHS = {
         "sigma": 0.86,
         "n": 1.65,
     },
+    "dahl": {
+        "polynomial.0": 0.131,
+        "polynomial.1": 1.1e-4,
+        **{f"heights.{i}": v for i, v in enumerate((5.1, 3.2, 0.2))},
+        **{f"rates.{i}": v for i, v in enumerate((0.017, 0.062, 0.31))},
+        **{f"exponents.{i}": v for i, v in enumerate((1.3, 0.9, 1.6))},
+    },
     "bashash_jalili": {
         "upper_output": 12.6,
         "rising_alpha": -0.34,
