@@ -106,7 +106,7 @@ def plant(model):
 def models():
     whole = {model for method in METHODS.values() for model in method.models}
     whole.remove("amplitude_scheduled")  # of several channels; designs are for one
-    return [automatic(record()), *parts(), *sorted(whole)]
+    return [automatic(record()).model, *parts(), *sorted(whole)]
 
 
 def loop_around(controller, system):

@@ -69,8 +69,8 @@ class Recipe(NamedTuple):
     that differ from ``system``, by path. ``gain`` is the path of a parameter that only
     scales the output. ``own`` holds the paths of parameters with a separate value for
     each record: the state before it began. ``vague`` holds those of the terms of a sum,
-    which only records of every kind of motion determine one by one; their first guesses
-    are typical values.
+    which only records of every kind of motion determine one by one, each with its
+    typical distance from the first guess.
     """
 
     system: System
@@ -78,7 +78,7 @@ class Recipe(NamedTuple):
     alternatives: Sequence[Mapping[str, float]] = ({},)
     gain: str | None = None
     own: tuple[str, ...] = ()
-    vague: tuple[str, ...] = ()
+    vague: Mapping[str, float] = {}
 
 
 class Part(NamedTuple):

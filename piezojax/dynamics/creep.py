@@ -82,7 +82,7 @@ class ExponentialCreep(Fittable):
         return Recipe(
             cls((0.01,) * 4, times, extent.dt),
             dict.fromkeys(gains, Range(-LARGEST, LARGEST)),
-            vague=gains,
+            vague=dict.fromkeys(gains, 0.01),
         )
 
     def init(self, input: ScalarLike = 0.0) -> Lags:

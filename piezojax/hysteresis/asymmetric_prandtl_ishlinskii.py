@@ -94,7 +94,7 @@ class AsymmetricPrandtlIshlinskii(Hysteresis, Fittable):
             rest_starts(extent),
             gain="polynomial.0",
             own=("rest_input",),
-            vague=(*FITTED_WEIGHTS, *skews),
+            vague=dict.fromkeys((*FITTED_WEIGHTS, *skews), 0.02 * abs(extent.slope)),
         )
 
     def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:

@@ -73,7 +73,7 @@ class PrandtlIshlinskii(Hysteresis, Fittable):
             rest_starts(extent),
             gain="polynomial.0",
             own=("rest_input",),
-            vague=FITTED_WEIGHTS,
+            vague=dict.fromkeys(FITTED_WEIGHTS, 0.02 * abs(extent.slope)),
         )
 
     def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:

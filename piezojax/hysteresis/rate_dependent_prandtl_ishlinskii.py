@@ -102,7 +102,7 @@ class RateDependentPrandtlIshlinskii(Hysteresis, Fittable):
             rest_starts(extent),
             gain="polynomial.0",
             own=("rest_input",),
-            vague=FITTED_WEIGHTS,
+            vague=dict.fromkeys(FITTED_WEIGHTS, 0.02 * abs(extent.slope)),
         )
 
     def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:

@@ -1,6 +1,7 @@
 """Default model: the hysteresis that describes a record best, and its dynamics."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,8 +11,10 @@ from ..hysteresis.model import hystereses
 from .chain import dynamics_of, dynamics_parts, structure
 from .estimators.free_runs import from_rest, starts_of
 from .estimators.output_error import leading, output_error
+from .estimators.resonances import LinearDynamics
 from .held_dynamics import HeldDynamics
 from .records.record import Record
+from .second_sight import seen_again
 
 HYSTERESES = (
     "shaped_coleman_hodgdon",
@@ -22,8 +25,17 @@ HYSTERESES = (
 represent three classes of loops: around an anhysteretic curve, with a memory that is
 wiped out, and with a memory that decays along the input."""
 
+PLAYS = HYSTERESES[1]
+"""The one of them behind which the dynamics are looked at."""
+
+FROM_SEVERAL = (*HYSTERESES[:2], "dahl")
+"""The same for several records: they determine the bends of several frictions."""
+
 CREEP = "exponential_creep"
 """Creep of the default model."""
+
+LOOKS = 1
+"""Looks at the dynamics behind the hysteresis before the choice."""
 
 CLEARLY = 0.8
 """Ratio to the error of the first model below which another one is chosen."""
@@ -39,8 +51,19 @@ hysteresis depends on every motion, the fast ones included."""
 RESOLVED = 8.0
 """Least number of samples in a period of the fastest resonance in a trial."""
 
-STEPS = 24
-"""Number of steps of a trial."""
+STEPS, PASSES = 24, 2
+"""Number of steps of a trial, and of its searches for the state before a record."""
+
+
+class Chosen(NamedTuple):
+    """A chain or a hysteresis by name, and the dynamics ``shown`` behind it.
+
+    ``shown`` are those that several records show behind a rough fit of plays, else
+    None.
+    """
+
+    model: str
+    shown: LinearDynamics | None
 
 
 def automatic(
@@ -48,7 +71,7 @@ def automatic(
     progress: Progress | None = None,
     beside: Sequence[Record] = (),
     dynamics: HeldDynamics | None = None,
-) -> str:
+) -> Chosen:
     """Return the default chain for ``record``, the training samples.
 
     The hysteresis is the first of ``HYSTERESES``, unless another one has a clearly
@@ -58,7 +81,8 @@ def automatic(
     With ``dynamics``, which are held, the chain has no other dynamics.
     """
     records = [record, *beside]
-    return _chain_of(hysteresis_for(records, progress, dynamics), records, dynamics)
+    name, shown = hysteresis_for(records, progress, dynamics)
+    return Chosen(_chain_of(name, records, dynamics), shown)
 
 
 def _chain_of(
@@ -73,26 +97,35 @@ def hysteresis_for(
     records: Sequence[Record],
     progress: Progress | None = None,
     dynamics: HeldDynamics | None = None,
-) -> str:
-    """Return the name of the hysteresis in ``HYSTERESES`` that fits ``records`` best.
+) -> Chosen:
+    """Return the name of the hysteresis that fits ``records`` best.
 
     Bounds, and the dynamics if they are not held, are derived from the first record.
     """
-    first, *others = HYSTERESES
+    first, *others = HYSTERESES if len(records) == 1 else FROM_SEVERAL
     if records[0].samples < LEAST:
-        return first
-    (progress or Silent()).stage("choosing the hysteresis")
+        return Chosen(first, None)
+    progress, shown = progress or Silent(), None
+    progress.stage("choosing the hysteresis")
     records = [
         each.until(leading(each.input, slice(0, each.samples)).stop) for each in records
     ]
+    if len(records) > 1 and dynamics is None:
+        whole = slice(0, max(record.samples for record in records))
+        plays = _chain_of(PLAYS, records, None)
+        shown = seen_again(plays, records, whole, progress, looks=LOOKS).shown
+    if len(records) > 1:
+        # Of one length, so that the programs of a trial are compiled once.
+        least = min(record.samples for record in records)
+        records = [record.until(least) for record in records]
     every = _slowing(records[0])
     slow = [_slowed(record, every) for record in records]
-    least, chosen = CLEARLY * _error(first, slow, dynamics), first
+    least, chosen = CLEARLY * _error(first, slow, dynamics, shown), first
     for name in others:
-        error = _error(name, slow, dynamics)
+        error = _error(name, slow, dynamics, shown)
         if error < least:
             least, chosen = error, name
-    return chosen
+    return Chosen(chosen, shown)
 
 
 def _slowing(record: Record) -> int:
@@ -134,7 +167,10 @@ def _slowed(record: Record, every: int) -> Record:
 
 
 def _error(
-    name: str, records: Sequence[Record], dynamics: HeldDynamics | None
+    name: str,
+    records: Sequence[Record],
+    dynamics: HeldDynamics | None,
+    shown: LinearDynamics | None,
 ) -> float:
     """Return the error of the model ``name`` after a short fit to each of ``records``.
 
@@ -145,14 +181,21 @@ def _error(
     """
     first, *beside = records
     chain = _chain_of(name, records, dynamics)
-    shape = structure(chain, first, dynamics, beside=beside)
+    shape = structure(chain, first, dynamics, beside=beside, shown=shown)
+    if shown is not None:
+        shape = shape._replace(whitening=())  # the dynamics are known already
     squares = []
     for record in records:
         others = [other for other in records if other is not record]
         every = slice(0, record.samples)
         try:
             system = output_error(
-                shape, [record], every, steps=STEPS, own_starts=bool(others)
+                shape,
+                [record],
+                every,
+                steps=STEPS,
+                own_starts=bool(others),
+                passes=PASSES,
             ).system
             hystereses(system)[0].inverse(first.input.min(), first.input.max())
         except ValueError:

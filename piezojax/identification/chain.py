@@ -115,16 +115,19 @@ def dynamics_parts(record: Record, beside: Sequence[Record] = ()) -> str:
     """Return the chain of linear dynamics that ``record`` shows, a lag if none.
 
     A slew rate is among them if the record shows one. Delay and slew rate are if this
-    record or those ``beside`` it have steps that are too few to tell them apart.
+    record or those ``beside`` it have steps that are too few to tell them apart. With
+    several records the chain has room for the modes, lag and delay that show only
+    behind a fitted hysteresis (``second_sight``).
     """
     shown = dynamics_of(record)
     if not shown.modes:
         return "lag"
+    several = bool(beside)
     late = shown.delay is not None and shown.delay > FRACTION * record.dt
     unclear = _unclear_step(record, beside) > 0.0
-    alone = len(shown.modes) == 1 and not shown.lags
+    alone = len(shown.modes) == 1 and not shown.lags and not several
     found = ["mode" if alone else "modes"]
-    found += ["delay"] * (late or unclear)
+    found += ["delay"] * (late or unclear or several)
     return "+".join(found + ["slew"] * (shown.slew is not None or unclear))
 
 
@@ -139,15 +142,19 @@ def _unclear_step(record: Record, beside: Sequence[Record]) -> float:
 
 
 def extent_of(
-    record: Record, beside: Sequence[Record] = (), reach: float = 1.0
+    record: Record,
+    beside: Sequence[Record] = (),
+    reach: float = 1.0,
+    shown: LinearDynamics | None = None,
 ) -> Extent:
     """Return the ranges of a record with one input and one output, and its dynamics.
 
     The range of the input is that of all records, with those ``beside`` it. ``reach``
-    is that of Extent.
+    is that of Extent. ``shown`` are the dynamics if they are known better than from the
+    record.
     """
     x, y = record.input, record.output
-    shown, span = dynamics_of(record), record.span
+    shown, span = shown or dynamics_of(record), record.span
     slope = span / float(np.ptp(x)) * float(np.sign(np.cov(x, y)[0, 1]) or 1.0)
     if shown.modes and shown.slope:
         # Beside a resonance the range of the output says little about the slope.
@@ -194,14 +201,19 @@ def structure(
     *,
     beside: Sequence[Record] = (),
     reach: float = 1.0,
+    shown: LinearDynamics | None = None,
 ) -> Structure:
     """Return the chain ``name`` with starts and bounds derived from ``record``.
 
-    They hold for the input of the records ``beside`` it too. An offset of the output is
-    always added. With ``dynamics``, which are held, the chain has no other dynamics.
-    ``reach`` is that of Extent. Raises ValueError as for ``chain`` and ``slow_chain``.
+    They hold for the input of the records ``beside`` it too. Each of several records
+    has another past: the virgin state of a hysteresis is then that at zero input and
+    output, as of a stage without power. An offset of the output is always added. With
+    ``dynamics``, which are held, the chain has no other dynamics. ``reach`` and
+    ``shown`` are those of ``extent_of``. Raises ValueError as for ``chain`` and
+    ``slow_chain``.
     """
-    extent, shown = extent_of(record, beside, reach), dynamics_of(record)
+    shown = shown or dynamics_of(record)
+    extent = extent_of(record, beside, reach, shown)
     known = known_parts()
     names = slow_chain(name, dynamics.source) if dynamics else chain(name)
     kinds = [known[part] for part in names]
@@ -226,6 +238,9 @@ def structure(
         },
     )
     system = series(**{place: part.system for place, part in parts.items()})
+    own = [f"{place}.{path}" for place, part in parts.items() for path in part.own]
+    if beside:
+        system = replace(system, dict.fromkeys(own, 0.0))
     gains = [f"{place}.{part.gain}" for place, part in parts.items() if part.gain]
     bounds = {
         f"{place}.{path}": bound
@@ -236,10 +251,6 @@ def structure(
     }
     space = space_of(bounds)
 
-    def of_parts(kind: str) -> tuple[str, ...]:
-        every = ((place, getattr(part, kind)) for place, part in parts.items())
-        return tuple(f"{place}.{path}" for place, paths in every for path in paths)
-
     def within(places: Sequence[str]) -> tuple[str, ...]:
         return tuple(path for path in bounds if path.split(".")[0] in places)
 
@@ -247,10 +258,15 @@ def structure(
         system,
         space,
         _starts(system, space, parts),
-        own=(*of_parts("own"), OFFSET),
+        own=(*own, OFFSET),
         dynamics=within(LINEAR),
         slow=within(SLOW),
-        vague=of_parts("vague"),
+        vague={
+            f"{place}.{path}": distance / (bound.upper - bound.lower)
+            for place, part in parts.items()
+            for path, distance in part.vague.items()
+            for bound in (part.bounds[path],)
+        },
         whitening=shown.whitening if shown.modes and dynamics is None else (),
     )
 

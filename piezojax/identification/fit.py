@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -243,7 +243,8 @@ def identify(
     check_approach(records, options)
     if model == DEFAULT:
         first, *beside = by_evidence(records, train)
-        model = automatic(first, progress, beside, options.dynamics)
+        model, shown = automatic(first, progress, beside, options.dynamics)
+        options = replace(options, shown=shown)
     shown = shown_dynamics(records, train)
     chosen, held = method_for(model, method), options.dynamics
     if held is not None and chosen.models:

@@ -19,7 +19,7 @@ from .estimators.linear import by_frequency_response, by_subspace
 from .estimators.model_bouc_wen import bouc_wen
 from .estimators.model_preisach import PLAIN, RATE_DEPENDENT, preisach_with_lag
 from .estimators.neural import fit_neural_state_space
-from .estimators.output_error import Optimum, output_error, values_and_errors
+from .estimators.output_error import PASSES, Optimum, output_error, values_and_errors
 from .estimators.regression import instrumental_variables, least_squares
 from .estimators.scheduled_fit import MODEL as SCHEDULED
 from .estimators.scheduled_fit import by_amplitude
@@ -27,6 +27,7 @@ from .estimators.steady_state import fit_structure, steady_response
 from .estimators.structure import Structure
 from .records.record import Record
 from .records.resample import average_periods, resample, whole_periods
+from .second_sight import seen_again
 
 EQUAL_LOSS = 1e-3
 """Relative excess of the mean square below which a fit equals the best one."""
@@ -59,6 +60,10 @@ def _by_output_error(
         else:
             first, *beside = by_evidence(records, train)
             shape = structure(model, first, options.dynamics, beside=beside)
+            if several and options.dynamics is None:
+                shape = seen_again(
+                    model, records, train, progress, options.shown
+                ).structure
         optimum = output_error(
             shape,
             records,
@@ -66,6 +71,7 @@ def _by_output_error(
             steps=options.steps,
             progress=progress,
             own_starts=several,
+            passes=PASSES - (shape.guess is not None),
         )
         found = LoopFit(optimum, optimum.system, shape, text, [])
     system, optimum, shape = found.system, found.optimum, found.shape

@@ -19,11 +19,12 @@ VAGUE += [f"creep.gains.{i}" for i in range(4)]
 
 
 def response(u):
-    """Return the motion of four plays without creep, from rest at 50 V."""
-    motion = 0.08 * u
+    """Return the motion of four plays without creep, virgin at 0 V."""
+    path = np.append(0.0, u)
+    motion = 0.08 * path
     for threshold, weight in ((5.0, 0.01), (12.0, 0.004), (25.0, 0.012), (40.0, 0.006)):
-        motion = motion + weight * oracle.play(u, threshold, 50.0)
-    return np.append(motion[0], motion[:-1])  # a voltage acts on the next sample
+        motion = motion + weight * oracle.play(path, threshold, 0.0)
+    return np.append(motion[1], motion[1:-1])  # a voltage acts on the next sample
 
 
 def record_of(height, seed):
@@ -47,7 +48,7 @@ def shape(records):
 
 def test_the_terms_of_sums_are_vague(shape):
     assert list(shape.vague) == VAGUE
-    assert structure("coleman_hodgdon+lag", record_of(8.0, 1)).vague == ()
+    assert structure("coleman_hodgdon+lag", record_of(8.0, 1)).vague == {}
 
 
 def problem_at_first_guess(shape, records):
@@ -66,9 +67,12 @@ def test_the_weight_is_that_of_one_independent_sample(shape, records, monkeypatc
     np.testing.assert_array_equal(found.known, fitted.starts[0])
     # A sine has one line: two independent numbers, its sine and its cosine.
     rms, independent = 0.3 / np.sqrt(2.0), 2 * 2
-    expected = rms / (0.02 * np.sqrt(independent))
+    # Typical distances as shares of the bounds: weights from 0 to 1 slope, gains +-0.1.
+    spread = np.array([0.02] * 10 + [0.01 / 0.2] * 4)
     held = [path in VAGUE for path in fitted.space.paths]
-    np.testing.assert_allclose(found.weights[held], expected)
+    np.testing.assert_allclose(
+        found.weights[held], rms / (spread * np.sqrt(independent))
+    )
     assert not found.weights[np.logical_not(held)].any()
     white = np.random.default_rng(0).standard_normal((2, SAMPLES))
     monkeypatch.setattr(type(problem), "errors", lambda self, unit: white)
@@ -93,9 +97,12 @@ def optimum(shape, records):
 
 
 def distance(optimum, shape):
-    """Return the largest distance of a creep gain from its first guess, in the box."""
+    """Return the largest distance of a gain from its first guess, in the box.
+
+    The two slowest exponentials, of 0.19 and 0.8 s, take longer than the cycles.
+    """
     fitted = shape.without(shape.own)
-    gains = [path in VAGUE[-4:] for path in fitted.space.paths]
+    gains = [path in VAGUE[-2:] for path in fitted.space.paths]
     return np.abs(optimum.units[0] - fitted.starts[0])[gains].max()
 
 
@@ -103,7 +110,7 @@ def test_gains_of_creep_that_is_not_seen_stay_near_the_first_guess(
     optimum, shape, records
 ):
     free = fits.output_error(
-        shape._replace(vague=()), records, slice(0, SAMPLES), steps=40
+        shape._replace(vague={}), records, slice(0, SAMPLES), steps=40
     )
     assert 5.0 * distance(optimum, shape) < distance(free, shape)
     assert optimum.losses[0] < 1.2 * free.losses[0]

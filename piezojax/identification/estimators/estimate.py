@@ -10,6 +10,7 @@ from ...core.system import System
 from ...dynamics import StateSpace
 from ..held_dynamics import HeldDynamics
 from .frequency import EmpiricalResponse
+from .resonances import LinearDynamics
 
 if TYPE_CHECKING:
     from ..known_plant import KnownPlant
@@ -42,7 +43,8 @@ class Options:
     steps of a descent. ``dynamics`` are held fixed in the fit of a chain.
     ``closed_loop`` is one of ``closed_loop.APPROACHES`` to a record of a closed loop,
     by default chosen from the record; ``controller`` is the controller that closed it,
-    for ``indirect``. ``known`` is a plant that is fitted again.
+    for ``indirect``. ``known`` is a plant that is fitted again. ``shown`` are the
+    linear dynamics of the stage, if the choice of the model has found them.
     """
 
     order: int = 4
@@ -53,6 +55,7 @@ class Options:
     closed_loop: str | None = None
     controller: System | None = None
     known: "KnownPlant | None" = None
+    shown: LinearDynamics | None = None
 
 
 class LinearDetail(NamedTuple):

@@ -38,12 +38,7 @@ ROUGH_STEPS = 24
 """Number of steps of a fit from which another one starts."""
 
 PASSES = 3
-"""Number of searches for the starts of several records, each followed by a fit."""
-
-CAUTION = 0.02
-"""Standard deviation of a vague parameter around the first start, as a share of its
-bounds. Two records may not determine each weight of a hysteresis: a third record, with
-another history, then has errors many times as large."""
+"""Searches for the starts of several records, each followed by a fit, by default."""
 
 NOISE_PASSES = 4
 """Largest number of alternate fits of a noise model and the parameters."""
@@ -117,6 +112,7 @@ def output_error(
     noise_model: bool = False,
     drives: Sequence[np.ndarray] | None = None,
     own_starts: bool = False,
+    passes: int = PASSES,
 ) -> Optimum:
     """Fit ``structure`` to ``records`` by the mean square of the free-run error.
 
@@ -128,7 +124,8 @@ def output_error(
     from the first sample on. With several records, or with ``own_starts``, the state
     before each record and its zero are estimated in place of the structure's ``own``
     parameters, and the ``vague`` parameters have a weak prior at the first start; its
-    scale follows from the errors of a first fit without it.
+    scale follows from the errors of a first fit without it. ``passes`` is the number of
+    searches for the states, each followed by a fit.
 
     With a ``noise_model`` the error is that of the prediction by the model and an
     autoregressive model of its errors, which are fitted alternately (Ljung, System
@@ -170,7 +167,7 @@ def output_error(
     progress.stage(f"compiling the fit of {starts.shape[1]} parameters")
     rough = min(steps, ROUGH_STEPS) if whitened or several else steps
     units, losses, finished = _inside(starts), np.zeros(len(starts)), False
-    rounds = PASSES if several else 1
+    rounds = passes if several else 1
     for left in reversed(range(rounds)):
         if several:
             system = problem.space.put(problem.system, as_array(units[0]))
@@ -222,8 +219,10 @@ def _lighter(prior: Prior, later: Prior) -> Prior:
 
 
 def _first_guess(structure: Structure, problem: Problem, unit: np.ndarray) -> Prior:
-    """Return the prior of the vague parameters around the first start.
+    """Return the prior of the vague parameters around the first guess.
 
+    Two records may not determine each weight of a hysteresis: without the prior, a
+    third record, with another history, has errors many times as large.
     The errors at ``unit`` are mostly those of the model, not white noise: the number of
     independent ones is the participation ratio of their spectrum.
     """
@@ -235,10 +234,9 @@ def _first_guess(structure: Structure, problem: Problem, unit: np.ndarray) -> Pr
     ]
     independent = sum(2.0 * np.sum(p) ** 2 / np.sum(p**2) for p in powers)
     rms = float(np.sqrt(np.mean(errors[counted] ** 2)))
-    vague = np.array([path in structure.vague for path in structure.space.paths])
-    return Prior(
-        structure.starts[0], vague * rms / (CAUTION * float(np.sqrt(independent)))
-    )
+    spread = [structure.vague.get(path, np.inf) for path in structure.space.paths]
+    known = structure.starts[0] if structure.guess is None else structure.guess
+    return Prior(known, rms / (np.array(spread) * float(np.sqrt(independent))))
 
 
 def _inside(units: np.ndarray) -> np.ndarray:

@@ -122,15 +122,34 @@ def _found(input: bytes, output: bytes, dt: float) -> LinearDynamics:
 
     rate = slew_rate(x, cost)
     x = x if rate is None else slewed(x, rate)
+    slopes = 1.0 - 2.0 * np.array(THRESHOLDS)
+    found = _shown(_Signals(_play_outputs(x), slopes, moved), dt)
+    return found if rate is None else found._replace(slew=rate / dt)
+
+
+def dynamics_behind(front: np.ndarray, output: np.ndarray, dt: float) -> LinearDynamics:
+    """Return the linear dynamics between ``front`` and ``output`` [samples].
+
+    ``front`` is the output of a fitted hysteresis under the input of the record. It
+    replaces the few plays of ``linear_dynamics``, whose errors hide a weak mode. The
+    slope found is that over ``front``.
+    """
+    x, y = _liveliest(front, output)
+    if x.size < SHORTEST:
+        return LinearDynamics()
+    signals = _above_slowest(x)[None], np.ones(1), _above_slowest(y)
+    return _shown(_Signals(*signals), dt)
+
+
+def _shown(signals: "_Signals", dt: float) -> LinearDynamics:
     try:
-        model = _chosen(_Signals(_play_outputs(x), moved))
+        model = _chosen(signals)
     except (ValueError, np.linalg.LinAlgError):
         return LinearDynamics()
     modes, lags = model.modes(dt), model.lags(dt)
     delay = model.extra_delay(modes, lags, dt)
     whitening = tuple(map(float, model.dynamics.noise))
-    slew = None if rate is None else rate / dt
-    return LinearDynamics(modes, lags, delay, model.slope(), whitening, slew)
+    return LinearDynamics(modes, lags, delay, model.slope(), whitening)
 
 
 def _liveliest(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -161,9 +180,13 @@ def _above_slowest(signal: np.ndarray) -> np.ndarray:
 
 
 class _Signals(NamedTuple):
-    """Outputs of the plays [plays, samples] and of the stage [samples], filtered."""
+    """Outputs of the plays [plays, samples] and of the stage [samples], filtered.
+
+    ``slopes`` [plays] are those of the plays over the full range of the input.
+    """
 
     plays: np.ndarray
+    slopes: np.ndarray
     output: np.ndarray
 
 
@@ -253,7 +276,7 @@ class _Hammerstein(NamedTuple):
 
     def slope(self) -> float:
         """Return the mean slope over the full range at the slowest frequencies."""
-        moved = self.weights @ (1.0 - 2.0 * np.array(THRESHOLDS))
+        moved = self.weights @ self.signals.slopes
         slow = self.dynamics.response(np.array([SLOWEST]))[0]
         return float(moved * abs(slow) * np.sign(np.real(slow)))
 
@@ -304,7 +327,7 @@ def _fitted(
     poles = 2 * modes + lags
     orders = (poles, max(1, poles), delay)
     model: _Hammerstein | None = None
-    weights = np.eye(len(THRESHOLDS))[0]
+    weights = np.eye(len(signals.plays))[0]
     for _ in range(ROUNDS):
         start = None if model is None else model.dynamics
         x = weights @ signals.plays

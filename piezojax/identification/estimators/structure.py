@@ -1,6 +1,6 @@
 """Structure: the input of estimators that search a box of parameters."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -26,11 +26,13 @@ class Structure(NamedTuple):
     ``own`` holds the paths of the state before a record and of the sensor's zero, which
     differ from record to record. ``dynamics`` holds the paths of linear dynamics,
     ``slow`` those of creep, which a short record does not determine, and ``vague``
-    those of the terms of a sum, as in Recipe.
+    those of the terms of a sum, each with its typical distance from the first guess, as
+    in Recipe, but in the unit box.
     ``whitening`` holds the coefficients of a filter that turns the errors into white
     noise; if it has any, the filtered errors count as much as the errors themselves,
     which are largest at low frequencies. ``prior`` is that of the parameters, if any.
-    ``weights`` are those of the errors of each record, by default equal.
+    ``weights`` are those of the errors of each record, by default equal. ``guess`` [n]
+    is the first guess of the vague parameters in the unit box, if no start has it.
     """
 
     system: System
@@ -39,10 +41,11 @@ class Structure(NamedTuple):
     own: tuple[str, ...] = ()
     dynamics: tuple[str, ...] = ()
     slow: tuple[str, ...] = ()
-    vague: tuple[str, ...] = ()
+    vague: Mapping[str, float] = {}
     whitening: tuple[float, ...] = ()
     prior: Prior | None = None
     weights: tuple[float, ...] = ()
+    guess: np.ndarray | None = None
 
     def weight(self, record: int) -> float:
         """Return the weight of the errors of a record."""
@@ -59,5 +62,10 @@ class Structure(NamedTuple):
         kept = {path: bounds for path, bounds in ranges.items() if path not in paths}
         columns = [path in kept for path in ranges]
         prior = self.prior and Prior(*(each[columns] for each in self.prior))
+        # Starts that differed only in the fixed parameters are one.
         starts = self.starts[:, columns]
-        return self._replace(space=space_of(kept), starts=starts, prior=prior)
+        starts = starts[np.sort(np.unique(starts, axis=0, return_index=True)[1])]
+        guess = None if self.guess is None else self.guess[columns]
+        return self._replace(
+            space=space_of(kept), starts=starts, prior=prior, guess=guess
+        )
