@@ -243,9 +243,8 @@ def identify(
     check_approach(records, options)
     if model == DEFAULT:
         first, *beside = by_evidence(records, train)
-        model, shown = automatic(first, progress, beside, options.dynamics)
-        options = replace(options, shown=shown)
-    shown = shown_dynamics(records, train)
+        model, found = automatic(first, progress, beside, options.dynamics)
+        options = replace(options, shown=found)
     chosen, held = method_for(model, method), options.dynamics
     if held is not None and chosen.models:
         raise ValueError(
@@ -263,6 +262,7 @@ def identify(
             f"a record of a closed loop by {options.closed_loop}"
         )
     estimate = chosen.estimate(model, records, train, options, progress or Silent())
+    shown = estimate.shown or shown_dynamics(records, train)
     feedback = [] if estimate.closed_loop else feedback_warnings(records, train)
 
     def of_each(check: Callable[[Record], Iterable[str]]) -> list[str]:

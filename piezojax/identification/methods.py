@@ -21,6 +21,7 @@ from .estimators.model_preisach import PLAIN, RATE_DEPENDENT, preisach_with_lag
 from .estimators.neural import fit_neural_state_space
 from .estimators.output_error import PASSES, Optimum, output_error, values_and_errors
 from .estimators.regression import instrumental_variables, least_squares
+from .estimators.resonances import LinearDynamics
 from .estimators.scheduled_fit import MODEL as SCHEDULED
 from .estimators.scheduled_fit import by_amplitude
 from .estimators.steady_state import fit_structure, steady_response
@@ -50,6 +51,7 @@ def _by_output_error(
 ) -> Estimate:
     # A stage whose plant is known was moved before the record.
     several = len(records) > 1 or options.known is not None
+    shown: LinearDynamics | None = None
     if options.known is None and is_closed(records, options):
         found = loop_fit(model, records, train, options, progress)
     else:
@@ -60,10 +62,10 @@ def _by_output_error(
         else:
             first, *beside = by_evidence(records, train)
             shape = structure(model, first, options.dynamics, beside=beside)
-            if several and options.dynamics is None:
-                shape = seen_again(
+            if beside and options.dynamics is None:
+                shape, shown = seen_again(
                     model, records, train, progress, options.shown
-                ).structure
+                )
         optimum = output_error(
             shape,
             records,
@@ -112,6 +114,7 @@ def _by_output_error(
         shape.order,
         bool(hystereses(shape.system)),
         closed_loop=found.text,
+        shown=shown,
     )
 
 
