@@ -17,7 +17,7 @@ from .rate_dependent_prandtl_ishlinskii import (
 )
 from .duhem import Duhem as Duhem
 from .normalised_bouc_wen import NormalisedBoucWen as NormalisedBoucWen
-from .dahl import Dahl as Dahl
+from .dahl_frictions import DahlFrictions as DahlFrictions
 from .bashash_jalili import BashashJalili as BashashJalili
 from .learned import LearnedOperator as LearnedOperator
 from .preisach import Preisach as Preisach

@@ -1,5 +1,6 @@
 """Default model: the hysteresis that describes a record best, and its dynamics."""
 
+import contextlib
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -28,7 +29,7 @@ wiped out, and with a memory that decays along the input."""
 PLAYS = HYSTERESES[1]
 """The one of them behind which the dynamics are looked at."""
 
-FROM_SEVERAL = (*HYSTERESES[:2], "dahl")
+FROM_SEVERAL = (*HYSTERESES[:2], "dahl_frictions")
 """The same for several records: they determine the bends of several frictions."""
 
 CREEP = "exponential_creep"
@@ -113,7 +114,9 @@ def hysteresis_for(
     if len(records) > 1 and dynamics is None:
         whole = slice(0, max(record.samples for record in records))
         plays = _chain_of(PLAYS, records, None)
-        shown = seen_again(plays, records, whole, progress, looks=LOOKS).shown
+        # Plays that do not fit leave the dynamics at first sight.
+        with contextlib.suppress(ValueError):
+            shown = seen_again(plays, records, whole, progress, looks=LOOKS).shown
     if len(records) > 1:
         # Of one length, so that the programs of a trial are compiled once.
         least = min(record.samples for record in records)

@@ -147,7 +147,7 @@ TRUTHS = {
         "sigma": 0.86,
         "n": 1.65,
     },
-    "dahl": {
+    "dahl_frictions": {
         "polynomial.0": 0.131,
         "polynomial.1": 1.1e-4,
         **{f"heights.{i}": v for i, v in enumerate((5.1, 3.2, 0.2))},

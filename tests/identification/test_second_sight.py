@@ -76,21 +76,25 @@ def test_a_short_record_shows_nothing():
 
 def test_a_second_look_gives_the_structure_both_modes(records):
     part = slice(0, records[0].samples)
-    once = structure("dahl+modes+delay", records[0], beside=records[1:])
+    once = structure("dahl_frictions+modes+delay", records[0], beside=records[1:])
     assert "dynamics.frequency.1" not in once.space.paths
-    seen = seen_again("dahl+modes+delay", records, part, Silent(), looks=1)
+    seen = seen_again("dahl_frictions+modes+delay", records, part, Silent(), looks=1)
     assert "dynamics.frequency.1" in seen.structure.space.paths
     assert [m.frequency for m in seen.shown.modes] == pytest.approx(MODES[:, 0], 0.01)
     assert len(seen.structure.starts) == 1
     guess = structure(
-        "dahl+modes+delay", records[0], beside=records[1:], shown=seen.shown
+        "dahl_frictions+modes+delay", records[0], beside=records[1:], shown=seen.shown
     ).starts[0]
     np.testing.assert_array_equal(seen.structure.guess, guess)
 
 
 def test_several_records_begin_with_a_stage_without_power(records):
     first, second = records
-    for model in ("dahl+lag", "coleman_hodgdon+lag", "prandtl_ishlinskii+lag"):
+    for model in (
+        "dahl_frictions+lag",
+        "coleman_hodgdon+lag",
+        "prandtl_ishlinskii+lag",
+    ):
         shape = structure(model, first, beside=[second])
         rests = [path for path in shape.own if "rest_" in path]
         assert rests
@@ -100,5 +104,5 @@ def test_several_records_begin_with_a_stage_without_power(records):
 
 
 def test_starts_that_differ_only_in_the_state_before_a_record_are_one(records):
-    shape = structure("dahl+lag", records[0])
+    shape = structure("dahl_frictions+lag", records[0])
     assert len(shape.starts) > len(shape.without(shape.own).starts) == 1

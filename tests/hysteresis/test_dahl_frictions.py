@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from oracles.stages import dahl as small_steps
 
 from piezojax.core.rollout import simulate
-from piezojax.hysteresis import Dahl, InverseHysteresis, NormalisedBoucWen
+from piezojax.hysteresis import DahlFrictions, InverseHysteresis, NormalisedBoucWen
 
 HEIGHTS, RATES, EXPONENTS = (3.0, 5.0, 2.0), (0.02, 0.05, 0.2), (0.7, 1.0, 1.9)
 PATH = np.array([0.0, 80.0, 20.0, 35.0, -10.0, 100.0, 60.0])
@@ -23,7 +23,7 @@ def run(model, inputs):
 
 def model(polynomial=(0.3,), **changed):
     fields = {"heights": HEIGHTS, "rates": RATES, "exponents": EXPONENTS} | changed
-    return Dahl(polynomial, **fields)
+    return DahlFrictions(polynomial, **fields)
 
 
 def test_a_step_equals_many_small_ones():
@@ -49,7 +49,7 @@ def test_a_step_equals_many_small_ones():
 )
 def test_the_virgin_curve_has_its_closed_form(exponent, force):
     x = np.linspace(0.0, 100.0, 41)
-    one = Dahl((1.0,), (8.0,), (0.04,), (exponent,))
+    one = DahlFrictions((1.0,), (8.0,), (0.04,), (exponent,))
     np.testing.assert_allclose(run(one, x), x - 8.0 * force(0.04 * x), atol=1e-12)
     np.testing.assert_allclose(run(one, -x), -run(one, x), atol=1e-12)
 
@@ -57,13 +57,13 @@ def test_the_virgin_curve_has_its_closed_form(exponent, force):
 def test_an_exponent_of_one_is_bouc_wen():
     x = 50.0 + 45.0 * np.sin(np.linspace(0.0, 20.0, 400))
     bouc_wen = NormalisedBoucWen(0.2, -1.6, 0.04, 1.0, 1.0, scheme="exact")
-    one = Dahl((0.2,), (8.0,), (0.04,), (1.0,))
+    one = DahlFrictions((0.2,), (8.0,), (0.04,), (1.0,))
     np.testing.assert_allclose(run(one, x), run(bouc_wen, x), atol=1e-11)
 
 
 @given(st.floats(0.5, 5.0), st.floats(-1.0, 1.0), st.floats(0.0, 200.0))
 def test_a_friction_stays_within_its_height_and_ends_at_it(exponent, force, path):
-    one = Dahl((1.0,), (8.0,), (0.04,), (exponent,))
+    one = DahlFrictions((1.0,), (8.0,), (0.04,), (exponent,))
     before = one.init(0.0)._replace(forces=(jnp.asarray(force),))
     after = float(one.step(before, path)[0].forces[0])
     assert -1.0 <= force <= after + 1e-12
@@ -83,7 +83,7 @@ def test_the_output_is_continuous_in_the_exponent():
 def test_derivatives_equal_differences(exponent):
     def last(values):
         rate, bend, height = values
-        one = Dahl((0.3, 1e-4), (height,), (rate,), (bend,))
+        one = DahlFrictions((0.3, 1e-4), (height,), (rate,), (bend,))
         return simulate(one, jnp.asarray(PATH), one.init(0.0))[1][-1]
 
     point = jnp.asarray([0.03, exponent, 6.0])
@@ -97,7 +97,7 @@ def test_derivatives_equal_differences(exponent):
 
 def test_the_gradient_is_finite_where_a_friction_has_ended():
     def last(bend):
-        one = Dahl((1.0,), (8.0,), (0.5,), (bend,))
+        one = DahlFrictions((1.0,), (8.0,), (0.5,), (bend,))
         x = jnp.asarray([0.0, 50.0, 60.0, 100.0])
         return jnp.sum(simulate(one, x, one.init(0.0))[1])
 
@@ -105,9 +105,9 @@ def test_the_gradient_is_finite_where_a_friction_has_ended():
 
 
 def test_the_inverse_exists_while_the_steepest_branch_rises():
-    InverseHysteresis(Dahl((0.3,), (8.0,), (0.06,), (1.0,)), 0.0, 100.0)
+    InverseHysteresis(DahlFrictions((0.3,), (8.0,), (0.06,), (1.0,)), 0.0, 100.0)
     with pytest.raises(ValueError, match="output rises"):
-        Dahl((0.3,), (8.0,), (0.07,), (1.0,)).inverse(0.0, 100.0)
+        DahlFrictions((0.3,), (8.0,), (0.07,), (1.0,)).inverse(0.0, 100.0)
 
 
 @pytest.mark.parametrize(

@@ -33,14 +33,14 @@ RATES, SHARES = (2.0, 5.0, 12.0), (0.03, 0.02, 0.005)
 The output rises on every branch, so that these values have an inverse."""
 
 
-class DahlState(NamedTuple):
+class Forces(NamedTuple):
     """Last input (V), and the force of each friction as a share of its largest."""
 
     input: Scalar
     forces: tuple[Scalar, ...]
 
 
-class Dahl(Hysteresis, Fittable):
+class DahlFrictions(Hysteresis, Fittable):
     """``y = P(x - sum_i heights[i] f_i)``: the input less several Dahl frictions.
 
     ``df_i/dx = rates[i] |1 - f_i sign(x')|^exponents[i]`` (Dahl 1976, AIAA Journal
@@ -67,7 +67,9 @@ class Dahl(Hysteresis, Fittable):
     rest_field: ClassVar[str | None] = "rest_input"
     laws: ClassVar[Laws] = differential_laws()
     part: ClassVar[Part] = Part(
-        "dahl", "hysteresis", "Dahl: the input less three frictions of any bend"
+        "dahl_frictions",
+        "hysteresis",
+        "Dahl: the input less three frictions of any bend",
     )
 
     polynomial: Scalars = parameter(
@@ -92,18 +94,18 @@ class Dahl(Hysteresis, Fittable):
                 "each friction needs one of each"
             )
 
-    def init(self, input: ScalarLike = 0.0) -> DahlState:
+    def init(self, input: ScalarLike = 0.0) -> Forces:
         virgin = (jnp.zeros(()),) * len(self.heights)
-        return self._moved(DahlState(self.rest_input, virgin), as_array(input))
+        return self._moved(Forces(self.rest_input, virgin), as_array(input))
 
-    def step(self, state: DahlState, input: ScalarLike) -> tuple[DahlState, Scalar]:
+    def step(self, state: Forces, input: ScalarLike) -> tuple[Forces, Scalar]:
         state = self._moved(state, as_array(input))
         left = state.input
         for height, force in zip(self.heights, state.forces, strict=True):
             left = left - height * force
         return state, polynomial_part(self.polynomial, left)
 
-    def _moved(self, state: DahlState, input: Scalar) -> DahlState:
+    def _moved(self, state: Forces, input: Scalar) -> Forces:
         change = input - state.input
         way = jnp.where(change >= 0.0, 1.0, -1.0)
         forces = tuple(
@@ -112,7 +114,7 @@ class Dahl(Hysteresis, Fittable):
                 state.forces, self.rates, self.exponents, strict=True
             )
         )
-        return DahlState(input, forces)
+        return Forces(input, forces)
 
     @classmethod
     def recipe(cls, extent: Extent) -> Recipe:
