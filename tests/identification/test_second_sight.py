@@ -76,14 +76,14 @@ def test_a_short_record_shows_nothing():
 
 def test_a_second_look_gives_the_structure_both_modes(records):
     part = slice(0, records[0].samples)
-    once = structure("dahl_frictions+modes+delay", records[0], beside=records[1:])
+    once = structure("coleman_hodgdon+modes+delay", records[0], beside=records[1:])
     assert "dynamics.frequency.1" not in once.space.paths
-    seen = seen_again("dahl_frictions+modes+delay", records, part, Silent(), looks=1)
+    seen = seen_again("coleman_hodgdon+modes+delay", records, part, Silent(), looks=1)
     assert "dynamics.frequency.1" in seen.structure.space.paths
     assert [m.frequency for m in seen.shown.modes] == pytest.approx(MODES[:, 0], 0.01)
     assert len(seen.structure.starts) == 1
     guess = structure(
-        "dahl_frictions+modes+delay", records[0], beside=records[1:], shown=seen.shown
+        "coleman_hodgdon+modes+delay", records[0], beside=records[1:], shown=seen.shown
     ).starts[0]
     np.testing.assert_array_equal(seen.structure.guess, guess)
 
