@@ -17,6 +17,7 @@ from .plays import (
     check_plays,
     plays_recipe,
     polynomial_part,
+    typical_distances,
     weighted_sum,
 )
 
@@ -94,7 +95,7 @@ class AsymmetricPrandtlIshlinskii(Hysteresis, Fittable):
             rest_starts(extent),
             gain="polynomial.0",
             own=("rest_input",),
-            vague=dict.fromkeys((*FITTED_WEIGHTS, *skews), 0.02 * abs(extent.slope)),
+            vague=typical_distances(extent, (*FITTED_WEIGHTS, *skews)),
         )
 
     def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:

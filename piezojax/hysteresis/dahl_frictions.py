@@ -27,7 +27,6 @@ the closed form is 0/0."""
 SPENT = 1e-12
 """Least remaining share of a force: with an exponent below 1 its end is reached."""
 
-
 RATES, SHARES = (2.0, 5.0, 12.0), (0.03, 0.02, 0.005)
 """Starting values of a fit: rates times the range of the input, heights divided by it.
 The output rises on every branch, so that these values have an inverse."""

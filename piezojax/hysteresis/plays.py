@@ -1,6 +1,7 @@
 """Play and stop operators, their weighted sums and the inverse of such a sum."""
 
 import itertools
+from collections.abc import Iterable
 from typing import Any
 
 import jax
@@ -58,6 +59,13 @@ def check_plays(thresholds: Memory, weights: Memory, name: str = "weights") -> N
             f"{len(thresholds)} thresholds and {len(weights)} {name}; "
             "each operator needs one of each"
         )
+
+
+def typical_distances(
+    extent: Extent, paths: Iterable[str] = FITTED_WEIGHTS
+) -> dict[str, float]:
+    """Return typical distances (um/V) of weights of plays from their first guesses."""
+    return dict.fromkeys(paths, 0.02 * abs(extent.slope))
 
 
 def plays_recipe(extent: Extent) -> tuple[dict[str, Any], dict[str, Range]]:

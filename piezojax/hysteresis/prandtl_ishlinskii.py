@@ -8,7 +8,6 @@ from ..core.recipe import Extent, Fittable, Part, Recipe, rest_starts
 from .inverse import Inverse, check_rising
 from .model import Hysteresis, Laws, turning_point_laws
 from .plays import (
-    FITTED_WEIGHTS,
     Memory,
     advance_plays,
     check_invertible,
@@ -16,6 +15,7 @@ from .plays import (
     invert_plays,
     plays_recipe,
     polynomial_part,
+    typical_distances,
     weighted_sum,
 )
 
@@ -73,7 +73,7 @@ class PrandtlIshlinskii(Hysteresis, Fittable):
             rest_starts(extent),
             gain="polynomial.0",
             own=("rest_input",),
-            vague=dict.fromkeys(FITTED_WEIGHTS, 0.02 * abs(extent.slope)),
+            vague=typical_distances(extent),
         )
 
     def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:

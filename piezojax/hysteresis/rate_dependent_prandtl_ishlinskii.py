@@ -11,7 +11,6 @@ from ..core.space import Range
 from .inverse import Inverse, check_rising
 from .model import STEP, Hysteresis, Laws
 from .plays import (
-    FITTED_WEIGHTS,
     Memory,
     advance_plays,
     check_invertible,
@@ -19,6 +18,7 @@ from .plays import (
     invert_plays,
     plays_recipe,
     polynomial_part,
+    typical_distances,
     weighted_sum,
 )
 from .prandtl_ishlinskii import PrandtlIshlinskii
@@ -102,7 +102,7 @@ class RateDependentPrandtlIshlinskii(Hysteresis, Fittable):
             rest_starts(extent),
             gain="polynomial.0",
             own=("rest_input",),
-            vague=dict.fromkeys(FITTED_WEIGHTS, 0.02 * abs(extent.slope)),
+            vague=typical_distances(extent),
         )
 
     def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:

@@ -75,8 +75,9 @@ def automatic(
 ) -> Chosen:
     """Return the default chain for ``record``, the training samples.
 
-    The hysteresis is the first of ``HYSTERESES``, unless another one has a clearly
-    smaller error (``CLEARLY``) after short fits to ``record`` and those ``beside`` it.
+    The hysteresis is the first of ``HYSTERESES``, or ``FROM_SEVERAL``, unless another
+    one has a clearly smaller error (``CLEARLY``) after short fits to ``record`` and
+    those ``beside`` it.
     The fits use the first samples of a long record (``leading``), and a lower sampling
     rate if it resolves the resonances and the input.
     With ``dynamics``, which are held, the chain has no other dynamics.
@@ -117,10 +118,9 @@ def hysteresis_for(
         # Plays that do not fit leave the dynamics at first sight.
         with contextlib.suppress(ValueError):
             shown = seen_again(plays, records, whole, progress, looks=LOOKS).shown
-    if len(records) > 1:
-        # Of one length, so that the programs of a trial are compiled once.
-        least = min(record.samples for record in records)
-        records = [record.until(least) for record in records]
+    # Of one length, so that the programs of a trial are compiled once.
+    shortest = min(record.samples for record in records)
+    records = [record.until(shortest) for record in records]
     every = _slowing(records[0])
     slow = [_slowed(record, every) for record in records]
     least, chosen = CLEARLY * _error(first, slow, dynamics, shown), first

@@ -61,11 +61,12 @@ def _by_output_error(
             text = is_closed(records, options) * FITTED_AGAIN
         else:
             first, *beside = by_evidence(records, train)
-            shape = structure(model, first, options.dynamics, beside=beside)
             if beside and options.dynamics is None:
                 shape, shown = seen_again(
                     model, records, train, progress, options.shown
                 )
+            else:
+                shape = structure(model, first, options.dynamics, beside=beside)
         optimum = output_error(
             shape,
             records,
@@ -73,7 +74,8 @@ def _by_output_error(
             steps=options.steps,
             progress=progress,
             own_starts=several,
-            passes=PASSES - (shape.guess is not None),
+            # A look has fitted the stage already.
+            passes=PASSES if shape.guess is None else PASSES - 1,
         )
         found = LoopFit(optimum, optimum.system, shape, text, [])
     system, optimum, shape = found.system, found.optimum, found.shape

@@ -137,8 +137,8 @@ def dynamics_behind(front: np.ndarray, output: np.ndarray, dt: float) -> LinearD
     x, y = _liveliest(front, output)
     if x.size < SHORTEST:
         return LinearDynamics()
-    signals = _above_slowest(x)[None], np.ones(1), _above_slowest(y)
-    return _shown(_Signals(*signals), dt)
+    signals = _Signals(_above_slowest(x)[None], np.ones(1), _above_slowest(y))
+    return _shown(signals, dt)
 
 
 def _shown(signals: "_Signals", dt: float) -> LinearDynamics:
