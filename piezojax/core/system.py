@@ -78,14 +78,10 @@ class Designed(System):
 
 def resolve(system: Any) -> Any:
     """Return ``system`` with every part that is Designed resolved."""
-
-    def is_designed(part: Any) -> bool:
-        return isinstance(part, Designed)
-
     return jax.tree.map(
-        lambda part: resolve(part.resolved()) if is_designed(part) else part,
+        lambda part: resolve(part.resolved()) if isinstance(part, Designed) else part,
         system,
-        is_leaf=is_designed,
+        is_leaf=lambda part: isinstance(part, Designed),
     )
 
 

@@ -4,6 +4,7 @@ JAX traces the function. Every array of the trace becomes a NumPy array of node 
 Operations that only move elements act on these numbers.
 """
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -362,13 +363,16 @@ def _bound(equation: Any, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
 def _source_of(equation: Any) -> str:
     """Return the function of the package that an equation comes from, or ""."""
     traceback = equation.source_info.traceback
-    if traceback is None:
-        return ""
-    for frame in traceback.frames:
-        path = Path(frame.file_name)
+    for frame in traceback.frames if traceback is not None else ():
         # A nested function or lambda has the name of the function that encloses it.
         name = frame.function_name.partition(".<")[0]
-        own = "piezojax" in path.parts and TRACERS.isdisjoint(path.parts)
-        if own and name[0] != "<":
+        if name[0] != "<" and _is_own(frame.file_name):
             return name
     return ""
+
+
+@functools.cache
+def _is_own(file: str) -> bool:
+    """Return whether a file is one of the package that describes a step."""
+    parts = Path(file).parts
+    return "piezojax" in parts and TRACERS.isdisjoint(parts)
