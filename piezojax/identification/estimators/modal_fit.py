@@ -195,21 +195,62 @@ def _with_another_mode(found: _Found, data: Lines) -> _Found:
     delay repeats.
     """
     shape = found.shape._replace(modes=found.shape.modes + 1)
-    w, zeta, _, lag, delay = parts(found.point, found.shape)
+    *_, delay = parts(found.point, found.shape)
     whole, data = data, _thinned(data)
-    ends = data.omega[0], data.highest
-    places = np.unique(
-        np.r_[np.geomspace(*ends, PLACES // 2), np.linspace(*ends, PLACES // 2)]
-    )
-    delays = np.arange(DELAYS) if shape.modes == 1 else delay
-    tried = [
-        _with_gains(
-            np.r_[w, place], np.r_[zeta, damping], np.r_[np.log(lag), late], shape, data
-        )
-        for late, damping, place in itertools.product(delays, DAMPINGS, places)
-    ]
-    starts = [*_best(tried), *_best(_rational(shape, data))]
+    delays = np.arange(float(DELAYS)) if shape.modes == 1 else delay
+    tried = [one for late in delays for one in _tries(found, late, data)]
+    gained = [_with_gains(one.point, shape, data) for one in _best(tried)]
+    starts = [*gained, *_best(_rational(shape, data))]
     return min((_refined(start.point, shape, whole) for start in starts), key=_COST)
+
+
+def _tries(found: _Found, late: float, data: Lines) -> list[_Found]:
+    """Return points with one mode more, without gains, and costs with the best gains.
+
+    They are those of a grid of frequencies and damping ratios with the delay ``late``.
+    What a mode explains follows from the part of its response that is orthogonal to
+    the responses of the other modes.
+    """
+    w, zeta, _, lag, _ = parts(found.point, found.shape)
+    rest = np.append(np.log(lag), late)
+    ends = data.omega[0], data.highest
+    half = PLACES // 2
+    places = np.unique([np.geomspace(*ends, half), np.linspace(*ends, half)])
+    grid = np.array(list(itertools.product(DAMPINGS, places))).T
+
+    def weighted(zeta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        shape, point = _point(w, zeta, rest, found.shape)
+        return _stacked(mode_columns(point, shape, data) / data.deviation[:, None])
+
+    known = np.linalg.qr(weighted(zeta, w))[0]
+    columns, left = weighted(*grid), _stacked(data.values / data.deviation)
+    columns = columns - known @ (known.T @ columns)
+    left = left - known @ (known.T @ left)
+    sizes = np.sum(columns**2, axis=0)
+    explained = (left @ columns) ** 2 / np.where(sizes > 0.0, sizes, np.inf)
+    return [
+        _Found(
+            *_point(np.append(w, place), np.append(zeta, damping), rest, found.shape),
+            0.5 * float(left @ left - gain),
+        )
+        for (damping, place), gain in zip(grid.T, explained, strict=True)
+    ]
+
+
+def _point(
+    w: np.ndarray, zeta: np.ndarray, rest: np.ndarray, shape: Shape
+) -> tuple[Shape, np.ndarray]:
+    """Return the shape with these modes instead of its own, and a point without gains.
+
+    ``rest`` are the other unknowns of the point.
+    """
+    modes = np.concatenate([np.log(w), np.log(zeta), np.zeros(w.size)])
+    return shape._replace(modes=w.size), np.concatenate([modes, rest])
+
+
+def _stacked(values: np.ndarray) -> np.ndarray:
+    """Return the real parts, followed by the imaginary parts."""
+    return np.concatenate([values.real, values.imag])
 
 
 def _thinned(data: Lines) -> Lines:
@@ -253,7 +294,7 @@ def _rational(shape: Shape, data: Lines) -> list[_Found]:
             )
             right = weight[:, 0] * values
             size = np.linalg.norm(rows, axis=0)
-            rows, right = (np.r_[part.real, part.imag] for part in (rows / size, right))
+            rows, right = _stacked(rows / size), _stacked(right)
             solution = np.linalg.lstsq(rows, right, rcond=None)[0] / size
             below = 1.0 + powers[:, 1:] @ solution[order - 1 :]
         coefficients = np.r_[solution[: order - 2 : -1], 1.0]
@@ -279,28 +320,17 @@ def _from_poles(
     w = np.clip(w, data.omega[0] / BEYOND, data.highest * BEYOND)
     zeta = np.clip(zeta, 2.0 * LEAST_DAMPING, MOST_DAMPING)
     lag = [-math.log(10.0 * data.highest)] if shape.lag else []
-    return _with_gains(w, zeta, np.r_[lag, late], shape, data)
+    return _with_gains(_point(w, zeta, np.append(lag, late), shape)[1], shape, data)
 
 
-def _with_gains(
-    w: np.ndarray,
-    zeta: np.ndarray,
-    rest: np.ndarray,
-    shape: Shape,
-    data: Lines,
-) -> _Found:
-    """Return the point of these modes with the best gains, and its cost.
-
-    ``rest`` are the other unknowns of a point.
-    """
-    n = shape.modes
-    point = np.concatenate([np.log(w), np.log(zeta), np.zeros(n), rest])
-    modes = mode_columns(point, shape, data) / data.deviation[:, None]
-    wanted = data.values / data.deviation
-    rows, wanted = (np.r_[part.real, part.imag] for part in (modes, wanted))
-    square, right = rows.T @ rows, rows.T @ wanted
+def _with_gains(point: np.ndarray, shape: Shape, data: Lines) -> _Found:
+    """Return ``point`` with the best gains, and its cost."""
+    modes = _stacked(mode_columns(point, shape, data) / data.deviation[:, None])
+    wanted = _stacked(data.values / data.deviation)
+    square, right = modes.T @ modes, modes.T @ wanted
     gains = np.linalg.lstsq(square, right, rcond=None)[0]
-    point[2 * n : 3 * n] = gains
+    point = point.copy()
+    point[2 * shape.modes : 3 * shape.modes] = gains
     return _Found(shape, point, 0.5 * float(wanted @ wanted - right @ gains))
 
 

@@ -113,7 +113,7 @@ def _rows(
 
 
 def _shifted(signal: np.ndarray, samples: int) -> np.ndarray:
-    return np.r_[np.zeros(samples), signal[: signal.size - samples]]
+    return np.concatenate([np.zeros(samples), signal[: signal.size - samples]])
 
 
 def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
