@@ -8,6 +8,7 @@ Lagrangian; its strategies are ``successive_halving`` and ``lockstep``.
 import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import jax
@@ -130,12 +131,12 @@ def in_batches(
     """
     count = len(jax.tree.leaves(points)[0])
     rows = np.minimum(np.arange(-(-count // width) * width), count - 1)
-
-    def of_batch(batch: np.ndarray) -> Any:
-        return program(jax.tree.map(lambda x: as_array(x[batch]), points))
-
-    results = each(of_batch, rows.reshape(-1, width))
+    results = each(partial(_on_batch, program, points), rows.reshape(-1, width))
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *results)
+
+
+def _on_batch(program: Callable[[Any], Any], points: Any, batch: np.ndarray) -> Any:
+    return program(jax.tree.map(lambda x: as_array(x[batch]), points))
 
 
 class BatchedDescents:
