@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -53,6 +54,12 @@ def common(function: Callable) -> Callable:
     ):
         function = option(function)
     return function
+
+
+def given(*names: str) -> list[str]:
+    """Return which of the options ``names`` the command line sets."""
+    source = click.get_current_context().get_parameter_source
+    return [name for name in names if source(name) is not ParameterSource.DEFAULT]
 
 
 class Command(click.Command):

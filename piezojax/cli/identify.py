@@ -4,7 +4,15 @@ from pathlib import Path
 
 import click
 
-from .command import Command, common, print_loading, print_results, results_folder, run
+from .command import (
+    Command,
+    common,
+    given,
+    print_loading,
+    print_results,
+    results_folder,
+    run,
+)
 from .identify_response import Amplitudes, ResponseOptions, fit_responses, load_dynamics
 from .records import SampleRange, print_columns, record_columns
 from .stopping import exit_interrupted
@@ -194,12 +202,14 @@ def main(
     piezojax[lab] also a .tdms, .lvm or .xlsx file.
     """
     del seed  # the random starts of a fit have fixed seeds
+    numbers = given("order", "window", "oversample", "steps")
 
     # JAX and its users are imported here, so that --help does not wait for them.
     def body(console):
         print_loading(console)
         from ..identification.estimators.estimate import Options
         from ..identification.fit import identify
+        from ..identification.methods import method_for
         from ..identification.records.record import read_record
         from ..report.fit_page import fit_page
         from ..report.fit_pictures import write_fit
@@ -225,6 +235,10 @@ def main(
                 "--dynamics needs one model: it excludes --response, --controller and "
                 "--model all"
             )
+        if response or controller:
+            check_used("with --response or --controller", ())
+        elif model != ALL:
+            check_used(f"in the fit of {model}", method_for(model, method).uses)
         if response:
             fit_responses(console, records, columns, responses, out)
             return
@@ -262,6 +276,11 @@ def main(
             page = fit_page(fit)
             write_page(page, folder, pictures)
         print_results(page, folder, console)
+
+    def check_used(where, used):
+        idle = [f"--{name}" for name in numbers if name not in used]
+        if idle:
+            raise ValueError(f"{', '.join(idle)}: not used {where}; leave it out")
 
     def controller_of(source, rate):
         from ..catalog import CONTROLLERS, at_rate

@@ -238,18 +238,24 @@ def _single(records: Records) -> Record:
 class Method(NamedTuple):
     """Summary, names of the ``models`` (none: chains of parts) and fit of a method.
 
-    ``closed_loop`` tells whether it takes the approaches to a closed loop.
+    ``uses`` are the numbers of Options that change the fit, and ``closed_loop`` tells
+    whether it takes the approaches to a closed loop.
     """
 
     summary: str
     models: tuple[str, ...]
     estimate: Callable[[str, Records, slice, Options, Progress], Estimate]
+    uses: tuple[str, ...] = ()
     closed_loop: bool = False
 
 
 METHODS: dict[str, Method] = {
     "output_error": Method(
-        "Levenberg-Marquardt on the free-run error", (), _by_output_error, True
+        "Levenberg-Marquardt on the free-run error",
+        (),
+        _by_output_error,
+        uses=("steps",),
+        closed_loop=True,
     ),
     "instrumental_variables": Method(
         "instrumental variables for a hysteretic ARMA model; no bias by sensor noise",
@@ -270,21 +276,25 @@ METHODS: dict[str, Method] = {
         "Hankel-Toeplitz regression with a prior (MAP); one record per input channel",
         ("state_space",),
         by_subspace,
+        uses=("order", "window"),
     ),
     "frequency_response": Method(
         "least squares on the transfer matrix of periodic records",
         ("state_space",),
         by_frequency_response,
+        uses=("order",),
     ),
     "scheduled_frequency_response": Method(
         "least squares on the transfer matrices of periodic records, by drive level",
         (SCHEDULED,),
         by_amplitude,
+        uses=("order", "steps"),
     ),
     "steady_state": Method(
         "Levenberg-Marquardt on the mean of the periods",
         ("bouc_wen", "neural_state_space"),
         _by_steady_state,
+        uses=("order", "oversample", "steps"),
     ),
 }
 """Methods by name; the first one that can fit a model is its default."""

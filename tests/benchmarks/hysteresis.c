@@ -351,6 +351,42 @@ INLINE void normalised_bouc_wen_step(const row *p, row *s, const double *x, doub
 
 MODEL(normalised_bouc_wen, 6, 2)
 
+/* P(u), u = x less heights times Dahl frictions f, with |1 - f sign(x')|^(1-n) growing
+   along x: the two numbers of P, heights, rates, exponents n, rest x. */
+
+enum { FRICTIONS = 3 };
+
+INLINE void dahl_frictions_start(const row *p, row *s)
+{
+    for (int i = 0; i < FRICTIONS; i++)
+        LANES s[i][l] = 0.0;
+    LANES s[FRICTIONS][l] = p[2 + 3 * FRICTIONS][l];
+}
+
+INLINE void dahl_frictions_step(const row *p, row *s, const double *x, double *y)
+{
+    LANES {
+        const double dx = x[l] - s[FRICTIONS][l], way = dx >= 0.0 ? 1.0 : -1.0;
+        double u = x[l];
+
+        for (int i = 0; i < FRICTIONS; i++) {
+            const double height = p[2 + i][l], rate = p[2 + FRICTIONS + i][l];
+            const double n = p[2 + 2 * FRICTIONS + i][l], path = rate * fabs(dx);
+            const double left = 1.0 - way * s[i][l];
+            const double grown = pow(left, 1.0 - n) + (n - 1.0) * path;
+            const double now = n == 1.0 ? left * exp(-path)
+                               : grown > 0.0 ? pow(grown, 1.0 / (1.0 - n)) : 0.0;
+
+            s[i][l] = way * (1.0 - now);
+            u -= height * s[i][l];
+        }
+        s[FRICTIONS][l] = x[l];
+        y[l] = u * (p[0][l] + u * p[1][l]);
+    }
+}
+
+MODEL(dahl_frictions, 12, FRICTIONS + 1)
+
 /* z' = alpha y' - beta_gamma |y'| |z|^(nu-1) z - beta_delta y' |z|^nu, a Runge-Kutta step
    along y, the input: alpha, beta_gamma, beta_delta, nu. Without force at y = 0. */
 

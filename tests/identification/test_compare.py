@@ -477,6 +477,15 @@ def test_the_command_writes_and_prints_a_comparison(made, file, tmp_path):
         (("--test", "0:5"), "--among and --test need --model all"),
         (("--among", "coleman_hodgdon"), "--among and --test need --model all"),
         (("--among", ""), "--among and --test need --model all"),
+        (("--order", "3"), "--order: not used in the fit of auto; leave it out"),
+        (
+            ("--model", "state_space", "--steps", "9", "--order", "3"),
+            "--steps: not used in the fit of state_space",
+        ),
+        (
+            ("--response", "--window", "9", "--oversample", "2"),
+            "--window, --oversample: not used with --response or --controller",
+        ),
     ],
 )
 def test_inconsistent_options_are_refused(file, arguments, message):

@@ -250,7 +250,7 @@ def _point(
 
 def _stacked(values: np.ndarray) -> np.ndarray:
     """Return the real parts, followed by the imaginary parts."""
-    return np.concatenate([values.real, values.imag])
+    return np.concatenate([np.real(values), np.imag(values)])
 
 
 def _thinned(data: Lines) -> Lines:
