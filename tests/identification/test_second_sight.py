@@ -32,7 +32,7 @@ def stage():
 
 def record_of(frequency, seed):
     one = stage()
-    time = np.arange(3000) / RATE
+    time = np.arange(2000) / RATE
     u = 40.0 + 14.0 * (time > 0.02)
     u += 45.0 * np.sin(2.0 * np.pi * frequency * np.maximum(time - 0.1, 0.0))
     first = one.reset(float(u[0]), seed)
