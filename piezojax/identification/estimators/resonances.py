@@ -58,6 +58,11 @@ HIGHEST = 0.45
 DAMPED = 0.5
 """Damping ratio above which a pair of poles is not a resonance."""
 
+WHOLE = 0.3
+"""Least static gain of all modes together, as a share of the response at the slowest
+frequencies. The stage moves through its modes, so that the share is near 1; that of
+poles beside zeros, which only fit noise, is a few hundredths."""
+
 EXPLAINED = 0.02
 """Least share of the output's power, in the octave around a mode, that the model of
 the record explains."""
@@ -209,6 +214,9 @@ class _Hammerstein(NamedTuple):
                 peak = abs(self.dynamics.response(np.array([cycles]))[0])
                 found.append((peak, cycles / dt, damping, gain))
         whole = sum(gain for *_, gain in found)
+        slow = self.dynamics.response(np.array([SLOWEST]))[0]
+        if abs(whole) < WHOLE * abs(slow):
+            return ()
         return tuple(
             Resonance(float(frequency), float(damping), float(gain / whole))
             for _, frequency, damping, gain in sorted(found, reverse=True)
