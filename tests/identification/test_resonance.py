@@ -28,6 +28,9 @@ def check(resonance, case):
 
 
 CASES = [case._replace(seconds=1.0) for case in records.grid()[1::6]]
+# At 0.4 of the sampling rate, a lag that is not found leaves the mode a third of its
+# gain.
+CASES.append(records.grid()[56])
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda c: f"{c.excitation}-{c.seed}")

@@ -58,10 +58,11 @@ HIGHEST = 0.45
 DAMPED = 0.5
 """Damping ratio above which a pair of poles is not a resonance."""
 
-WHOLE = 0.3
+WHOLE = 0.1
 """Least static gain of all modes together, as a share of the response at the slowest
-frequencies. The stage moves through its modes, so that the share is near 1; that of
-poles beside zeros, which only fit noise, is a few hundredths."""
+frequencies. The stage moves through its modes, so that the share is near 1, or a third
+behind a lag too short to be found. That of poles beside zeros, which fit only noise, is
+a few hundredths."""
 
 EXPLAINED = 0.02
 """Least share of the output's power, in the octave around a mode, that the model of
