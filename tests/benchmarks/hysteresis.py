@@ -17,6 +17,7 @@ import ctypes
 import json
 import math
 import statistics
+import sys
 import time
 from pathlib import Path
 
@@ -320,7 +321,7 @@ def parse(arguments=None):
 def main(arguments=None):
     options = parse(arguments)
     throughput.pin_to_one_core()
-    console, rows = Console(), []
+    console, rows = Console(width=None if sys.stdout.isatty() else 120), []
     for name in options.models:
         if not has_c_reference(name):
             console.print(f"{name}: no reference in C")
