@@ -36,6 +36,7 @@ from .modal_model import (
     mode_columns,
     parts,
     residuals,
+    stacked,
 )
 
 MOST_MODES = 6
@@ -220,10 +221,10 @@ def _tries(found: _Found, late: float, data: Lines) -> list[_Found]:
 
     def weighted(zeta: np.ndarray, w: np.ndarray) -> np.ndarray:
         shape, point = _point(w, zeta, rest, found.shape)
-        return _stacked(mode_columns(point, shape, data) / data.deviation[:, None])
+        return stacked(mode_columns(point, shape, data) / data.deviation[:, None])
 
     known = np.linalg.qr(weighted(zeta, w))[0]
-    columns, left = weighted(*grid), _stacked(data.values / data.deviation)
+    columns, left = weighted(*grid), stacked(data.values / data.deviation)
     columns = columns - known @ (known.T @ columns)
     left = left - known @ (known.T @ left)
     sizes = np.sum(columns**2, axis=0)
@@ -246,11 +247,6 @@ def _point(
     """
     modes = np.concatenate([np.log(w), np.log(zeta), np.zeros(w.size)])
     return shape._replace(modes=w.size), np.concatenate([modes, rest])
-
-
-def _stacked(values: np.ndarray) -> np.ndarray:
-    """Return the real parts, followed by the imaginary parts."""
-    return np.concatenate([np.real(values), np.imag(values)])
 
 
 def _thinned(data: Lines) -> Lines:
@@ -294,7 +290,7 @@ def _rational(shape: Shape, data: Lines) -> list[_Found]:
             )
             right = weight[:, 0] * values
             size = np.linalg.norm(rows, axis=0)
-            rows, right = _stacked(rows / size), _stacked(right)
+            rows, right = stacked(rows / size), stacked(right)
             solution = np.linalg.lstsq(rows, right, rcond=None)[0] / size
             below = 1.0 + powers[:, 1:] @ solution[order - 1 :]
         coefficients = np.r_[solution[: order - 2 : -1], 1.0]
@@ -325,8 +321,8 @@ def _from_poles(
 
 def _with_gains(point: np.ndarray, shape: Shape, data: Lines) -> _Found:
     """Return ``point`` with the best gains, and its cost."""
-    modes = _stacked(mode_columns(point, shape, data) / data.deviation[:, None])
-    wanted = _stacked(data.values / data.deviation)
+    modes = stacked(mode_columns(point, shape, data) / data.deviation[:, None])
+    wanted = stacked(data.values / data.deviation)
     square, right = modes.T @ modes, modes.T @ wanted
     gains = np.linalg.lstsq(square, right, rcond=None)[0]
     point = point.copy()

@@ -188,7 +188,12 @@ def residuals(
     value, slopes = response(point, shape, data)
     left = (value - data.values) / data.deviation
     rows = slopes / data.deviation[:, None]
-    return np.r_[left.real, left.imag], np.r_[rows.real, rows.imag]
+    return stacked(left), stacked(rows)
+
+
+def stacked(values: np.ndarray) -> np.ndarray:
+    """Return the real parts, followed by the imaginary parts."""
+    return np.concatenate([np.real(values), np.imag(values)])
 
 
 def bounds(shape: Shape, data: Lines) -> tuple[np.ndarray, np.ndarray]:
