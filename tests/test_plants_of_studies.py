@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import hashlib
 import json
 import tomllib
 
@@ -21,7 +22,14 @@ from piezojax.identification.residual_record import (
     residual_path,
 )
 from piezojax.report.fit_pictures import write_model
-from piezojax.study import Study, as_toml, build, sha256_of, study_schema
+from piezojax.study import (
+    Study,
+    as_toml,
+    build,
+    contents_of,
+    sha256_of,
+    study_schema,
+)
 from piezojax.study.schema import AxesTable
 from piezojax.study.study_file import _FILES
 from piezojax.tuning.data import make_data
@@ -110,9 +118,25 @@ def test_a_study_keeps_its_records_and_its_hash_in_another_folder():
     study = study_of()
     moved = study_of(**tomllib.loads(as_toml(study, lambda file: f"../{file}")))
     assert moved.plant["record"] == ["../a.csv", "../b.csv"]
-    assert sha256_of(moved) == sha256_of(study)
+    assert sha256_of(moved, ()) == sha256_of(study, ())
     renamed = study_of(**tomllib.loads(as_toml(study, lambda file: f"{file}_2")))
-    assert sha256_of(renamed) != sha256_of(study)
+    assert sha256_of(renamed, ()) != sha256_of(study, ())
+
+
+def test_the_hash_of_a_study_follows_the_content_of_its_files(tmp_path):
+    study = study_of()
+    for name in ("a.csv", "b.csv"):
+        (tmp_path / name).write_text(name, encoding="utf-8")
+    contents = contents_of(study, tmp_path)
+    expected = [
+        hashlib.sha256(name.encode()).hexdigest() for name in ("a.csv", "b.csv")
+    ]
+    assert contents == tuple(expected)
+    first = sha256_of(study, contents)
+    (tmp_path / "b.csv").write_text("longer", encoding="utf-8")
+    assert sha256_of(study, contents_of(study, tmp_path)) != first
+    (tmp_path / "b.csv").unlink()
+    assert contents_of(study, tmp_path) == (expected[0], "")
 
 
 def texts_in(content):
@@ -148,7 +172,7 @@ def test_every_file_of_a_study_is_renamed(plant):
     assert sum("d/" in text for text in found) == 7 + len(texts_in(plant))
     assert not [text for text in found if text.startswith("d/")]
     inner = study_of(**tomllib.loads(as_toml(study, lambda name: f"e/{name}")))
-    assert sha256_of(inner) == sha256_of(study)
+    assert sha256_of(inner, ()) == sha256_of(study, ())
 
 
 def test_no_field_of_a_study_with_a_file_is_forgotten():

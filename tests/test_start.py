@@ -16,7 +16,7 @@ from piezojax.control import PID
 from piezojax.identification import Record, read_record
 from piezojax.identification.records.recognise import noise_rms, recognised
 from piezojax.signals import signal, time_grid
-from piezojax.study import build, load, sha256_of
+from piezojax.study import build, contents_of, load, sha256_of
 from piezojax.study.first_plan import Plan, doubts, planned
 from piezojax.study.first_study import first_study
 from piezojax.tuning.result import Result, Scores
@@ -340,7 +340,9 @@ class Verbs:
         result = RESULT.model_copy(update=self.found)
         out.mkdir(parents=True)
         (out / "result.json").write_text(result.model_dump_json(), encoding="utf-8")
-        about = About(study_sha256=sha256_of(load(study)))
+        known = load(study)
+        contents = contents_of(known, study.parent)
+        about = About(study_sha256=sha256_of(known, contents))
         save(PID(0.1, 1.0, dt=1e-3), out / "gains.toml", about)
         return SimpleNamespace(result=result, case=None, holdout=None)
 
@@ -473,6 +475,23 @@ def test_a_changed_study_is_tuned_again(run, tmp_path):
     # the first answers again: their gains are there
     path.write_text(text, encoding="utf-8")
     status, output, calls = run()
+    assert (status, calls) == (0, [])
+    assert f"the gains are in {tmp_path / 'out' / 'tuned'}\n" in output
+
+
+def test_a_changed_record_is_tuned_again(run, tmp_path, record):
+    run("--yes")
+    content = record.read_bytes()
+    try:
+        record.write_bytes(content + b"3.0,10.0,1.0\n")
+        status, output, calls = run("--yes")
+    finally:
+        record.write_bytes(content)
+    assert (status, calls) == (0, [("tune", "tuned-2"), ("export", "tuned-2", "c")])
+    assert "note: study.toml or its record has changed since tuned; the values" in (
+        output
+    )
+    status, output, calls = run("--yes")
     assert (status, calls) == (0, [])
     assert f"the gains are in {tmp_path / 'out' / 'tuned'}\n" in output
 

@@ -186,12 +186,12 @@ def _runs(
     """Return the runs of the study at ``named`` for ``controller`` with ``about``.
 
     ``named`` defaults to the study.toml beside the ``file`` of the controller. Raises
-    ValueError if study and controller have different sampling rates, and for a
-    study.toml with another SHA-256 than the study of the controller.
+    ValueError if study and controller have different sampling rates, and as
+    ``require_own`` for that study.toml.
     """
     from .. import study as studies
     from ..tuning.exported_runs import holdout_of, make_runs
-    from ..tuning.result import STUDY_FILE
+    from ..tuning.result import STUDY_FILE, require_own
 
     path = study_path(named or file.with_name(STUDY_FILE))
     case = studies.read(path, about.seed)
@@ -200,7 +200,6 @@ def _runs(
             f"{path} is for {case.study.rate:g} Hz, the controller for "
             f"{about.rate_Hz:g} Hz"
         )
-    known = None if named else about.study_sha256
-    if known and studies.sha256_of(case.study) != known:
-        raise ValueError(f"{path} is not the study of {file}: its SHA-256 differs")
+    if not named:
+        require_own(case, about, file)
     return make_runs(case, holdout_of(case, controller))

@@ -112,7 +112,7 @@ def main(record, model, check, yes, sliders, out, seed, quiet, **given):
             console.print(f"going on in {folder} with its {STUDY}", soft_wrap=True)
         else:
             _write_study(study, record, given, model, check, yes, seed, console)
-        tuned, outcome = _finished(study), None
+        tuned, outcome = _finished(study, console), None
         if tuned is None:
             tuned = numbered_folder(folder / TUNED)
             try:
@@ -240,22 +240,29 @@ def _check_same(study: Path, record: Path, given: dict[str, Any]) -> None:
         )
 
 
-def _finished(study: Path) -> Path | None:
+def _finished(study: Path, console: Console) -> Path | None:
     """Return the newest folder of gains of a finished search on ``study``, or None.
 
-    Gains of an earlier version of the study do not count.
+    Gains of an earlier version of the study or of its record do not count.
     """
     from ..core.serial import read_about
-    from ..study import load, sha256_of
+    from ..study import contents_of, load, sha256_of
     from ..tuning.result import GAINS_FILE, RESULT_FILE, load_result
 
-    wanted, found = sha256_of(load(study)), []
+    known, found = load(study), []
+    wanted = sha256_of(known, contents_of(known, study.parent))
     for file in study.parent.glob(f"{TUNED}*/{RESULT_FILE}"):
         folder = file.parent
         if load_result(folder).status == INTERRUPTED:
             continue
         if read_about(folder / GAINS_FILE).study_sha256 == wanted:
             found.append(folder)
+        else:
+            console.print(
+                f"note: {study.name} or its record has changed since {folder.name}; "
+                f"the values in {study.name} stay as they are written",
+                soft_wrap=True,
+            )
     return max(found, key=lambda folder: folder.stat().st_mtime, default=None)
 
 

@@ -18,10 +18,10 @@ class About(BaseModel):
     """Origin of a saved System, and the reasons not to use it.
 
     ``piezojax`` is the version that wrote the file. ``study`` is the name of the study
-    with its ``seed``, ``study_sha256`` the hash of its file, ``record`` the origin of
-    the record of a fit, and ``rate_Hz`` the sampling rate. ``units`` maps the channels
-    of the System to their units, and ``parameter_units`` its parameters, by path; "" is
-    an unknown unit.
+    with its ``seed``, ``study_sha256`` the hash of the study and its files, ``record``
+    the origin of the record of a fit, and ``rate_Hz`` the sampling rate. ``units`` maps
+    the channels of the System to their units, and ``parameter_units`` its parameters,
+    by path; "" is an unknown unit.
     ``input_ranges`` are the least and greatest value of each input in the record.
     ``judged`` lists the margins that a controller was judged with, a sentence each,
     and ``plants`` the ranges of the plants on which they hold.

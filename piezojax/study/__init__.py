@@ -16,6 +16,7 @@ from .ensemble import Stage as Stage
 from .json_schema import study_schema as study_schema
 from .schema import Study as Study
 from .study_file import as_toml as as_toml
+from .study_file import contents_of as contents_of
 from .study_file import load as load
 from .study_file import sha256_of as sha256_of
 

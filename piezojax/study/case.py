@@ -32,7 +32,7 @@ from .parameters import check_value, search_space
 from .references import reference_signals
 from .schema import Study
 from .sources import about_file, source_error, system_of
-from .study_file import load
+from .study_file import contents_of, load, sha256_of
 from .trajectories import read_trajectories
 
 
@@ -53,7 +53,7 @@ class Case:
     ``study.sensor.noise_rms`` is then the rms value of ``sensor_noise``.
     ``saved_residual`` is the residual of a plant from a file, ``response`` the model of
     a plant that is fitted to a frequency response. The names of files in ``study`` are
-    relative to ``folder``.
+    relative to ``folder``; ``contents`` are their SHA-256 when the case was built.
     """
 
     study: Study
@@ -74,6 +74,12 @@ class Case:
     saved_residual: ResidualRecord | None = None
     response: ResponseModel | None = None
     folder: Path = Path()
+    contents: tuple[str, ...] = ()
+
+    @property
+    def sha256(self) -> str:
+        """SHA-256 that identifies the study with its files."""
+        return sha256_of(self.study, self.contents)
 
     @cached_property
     def residual(self) -> ResidualRecord | None:
@@ -117,6 +123,7 @@ def build(
     path = Path(path)
     if seed is not None:
         study = study.model_copy(update={"seed": seed})
+    contents = contents_of(study, path.parent)  # before a file can change
     trajectories = read_trajectories(study, path.parent)
     study, measured = _with_measured_noise(study, path.parent)
     plant, about, fit, response, notes_of_plant = _plant(
@@ -180,6 +187,7 @@ def build(
         saved_residual=_saved_residual(study, path.parent, about),
         response=response,
         folder=path.parent,
+        contents=contents,
     )
 
 

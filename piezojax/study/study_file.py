@@ -1,7 +1,7 @@
 """Files of studies: reading, writing and their checksum."""
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, get_args
 
@@ -56,13 +56,31 @@ def _with_files(content: Any, renamed: Callable[[str], str], key: str = "") -> A
     return renamed(content) if key in _FILES and isinstance(content, str) else content
 
 
-def sha256_of(study: Study) -> str:
-    """Return the SHA-256 of ``as_toml`` with the folders of file names left out.
+def contents_of(study: Study, folder: Path) -> tuple[str, ...]:
+    """Return the SHA-256 of each file that ``study`` names, "" if it cannot be read.
 
-    It identifies a study; comments and the folder of the study do not count.
+    The names of the files are relative to ``folder``.
     """
-    text = as_toml(study, lambda file: Path(file).name)
-    return hashlib.sha256(text.encode("utf-8")).hexdigest()
+    names: list[str] = []
+    as_toml(study, lambda name: names.append(name) or name)
+
+    def content_of(name: str) -> str:
+        try:
+            return hashlib.sha256((folder / name).read_bytes()).hexdigest()
+        except OSError:
+            return ""
+
+    return tuple(content_of(name) for name in names)
+
+
+def sha256_of(study: Study, contents: Iterable[str]) -> str:
+    """Return the SHA-256 that identifies ``study`` with its files.
+
+    It is that of ``as_toml``, with the folders of file names left out, followed by the
+    ``contents_of`` the files. Comments and the folder of the study do not count.
+    """
+    text = as_toml(study, lambda name: Path(name).name)
+    return hashlib.sha256("".join([text, *contents]).encode("utf-8")).hexdigest()
 
 
 def load(path: str | Path) -> Study:

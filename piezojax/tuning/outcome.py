@@ -21,7 +21,7 @@ from ..core.paths import parameters
 from ..core.rollout import simulate
 from ..core.serial import to_data
 from ..core.system import System, resolve
-from ..study import Case, sha256_of
+from ..study import Case
 from .alarms import exact_figures, exact_peak
 from .baselines import Baselines
 from .coupling import Coupling, coupling_matrix
@@ -72,7 +72,7 @@ class Outcome:
         samples = references.reshape(-1, study.axis_count if axes else 1)
         return About(
             study=self.case.name,
-            study_sha256=sha256_of(study),
+            study_sha256=self.case.sha256,
             seed=study.seed,
             rate_Hz=study.rate,
             judged=self.judged,

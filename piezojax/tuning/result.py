@@ -10,10 +10,11 @@ from pydantic import BaseModel, ConfigDict
 
 from ..analysis.constraints import CONSTRAINTS, LoopFigures, worst_by_plant
 from ..analysis.stability.measured_margins import MeasuredMargins
+from ..core.about import About
 from ..core.feedback import Feedback
 from ..core.files import read_model
 from ..core.metrics import TrackingFigures
-from ..core.serial import load
+from ..core.serial import load, read_about
 from ..solve.problem import TOLERANCE
 from ..solve.search_state import Status
 from ..study import Case, read
@@ -341,8 +342,22 @@ def load_loop(
     """Return the Case and the tuned loop of a ``folder`` of ``tune``.
 
     ``study`` is the file of the study, by default the one in the folder. Raises
-    ValueError as ``study.read`` and ``load`` do.
+    ValueError as ``study.read``, ``load`` and ``require_own`` do.
     """
-    case = read(study or folder / STUDY_FILE)
-    controller = load(folder / GAINS_FILE, accept_unsafe=accept_unsafe)
+    case, file = read(study or folder / STUDY_FILE), folder / GAINS_FILE
+    controller = load(file, accept_unsafe=accept_unsafe)
+    if study is None:
+        require_own(case, read_about(file), file)
     return case, replace(case.loop, controller=controller)
+
+
+def require_own(case: Case, about: About, file: Path) -> None:
+    """Raise ValueError if ``case`` is not that of the gains in ``file``.
+
+    ``case`` was built from the study beside them, and ``about`` is their origin.
+    """
+    if about.study_sha256 not in (None, case.sha256):
+        raise ValueError(
+            f"{file.with_name(STUDY_FILE)} is not the study of {file}, or a file that "
+            "it names has changed since: the SHA-256 differs"
+        )

@@ -134,7 +134,7 @@ def _report(
     folder: Path, name: str, study: Study, case: Case, stage: Stage
 ) -> RetuneReport:
     """Return the report in ``folder``, to be continued, or a new one."""
-    file, known = folder / RETUNE_FILE, sha256_of(study)
+    file, known = folder / RETUNE_FILE, sha256_of(study, case.contents)
     if not file.exists():
         own = scalars(case.loop.controller)
         return RetuneReport(

@@ -470,6 +470,13 @@ def test_the_command_fills_a_buffer(results, tmp_path):
     assert not (out / "record.csv").exists()
     rows = np.loadtxt(out / "designed.csv", delimiter=",", skiprows=1)
     assert len(rows) <= 256
+    plant = tmp_path / "model.json"
+    plant.write_text(plant.read_text(encoding="utf-8") + "\n", encoding="utf-8")
+    refused = call("excite", results, "--out", tmp_path / "other")
+    assert refused.exit_code == 1
+    assert "or a file that it names has changed since: the SHA-256 differs" in (
+        refused.stderr
+    )
 
 
 def test_a_record_must_be_longer_than_its_move_back(case):
