@@ -34,10 +34,10 @@ def identity_of(simulator: Simulator) -> dict[str, Any]:
         "sensor": case.loop.sensor,
         **{f"plant {name}": plant for name, plant in simulator.plants.items()},
     }
-    # The built Systems stand for the contents of the files that the study names.
     built = {name: _rounded(to_data(system)) for name, system in systems.items()}
     return {
         "study": case.study.model_dump(mode="json", exclude_none=True),
+        "files": list(case.contents),
         "systems": _hash(built),
         "points": _hash(_rounded(plan.values(0, min(plan.points, 4096)).tolist())),
         "plan": {

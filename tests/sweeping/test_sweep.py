@@ -1,5 +1,6 @@
 """Sweeps from study to data set: the numbers, the labels, the files, the command."""
 
+import dataclasses
 import json
 import shutil
 
@@ -279,6 +280,8 @@ def test_foreign_folders_and_chunks_are_refused(case_of, write, tmp_path):
         ValueError, match=r"holds another sweep \(it differs in study\.sweep"
     ):
         run_sweep(other, tmp_path / "a")
+    with pytest.raises(ValueError, match=r"\(it differs in files\); name a new"):
+        run_sweep(dataclasses.replace(case, contents=("new content",)), tmp_path / "a")
     run_sweep(other, tmp_path / "b")
     name = "00000001.chunk"
     shutil.copy(tmp_path / "a" / "chunks" / name, tmp_path / "b" / "chunks" / name)
