@@ -30,7 +30,7 @@ from piezojax.study import (
     sha256_of,
     study_schema,
 )
-from piezojax.study.schema import AxesTable
+from piezojax.study.stage_tables import AxesTable
 from piezojax.study.study_file import _FILES
 from piezojax.tuning.data import make_data
 from piezojax.tuning.make_result import _residual_notes

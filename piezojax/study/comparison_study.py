@@ -15,7 +15,9 @@ from ..core.plain import read_plain
 from ..core.system import Affine
 from .case import Case, build, read
 from .ensemble_table import EnsembleTable
-from .schema import ObjectiveTable, OptimiserTable, References, Study
+from .reference_table import References
+from .schema import Study
+from .search_tables import ObjectiveTable, OptimiserTable
 from .stage_tables import DisturbanceTable, SensorTable
 from .tables import Positive, RangeTable, Table, one_of, validated
 

@@ -10,7 +10,8 @@ from ..core.paths import declared, get, matching, replace
 from ..core.serial import from_data, to_data
 from ..core.space import Range, Space, space_of
 from ..core.system import System
-from .schema import Study, TunedTable
+from .schema import Study
+from .search_tables import TunedTable
 
 PART = "controller."
 """Prefix of every tuned path; parameters of the stage are not tuned."""

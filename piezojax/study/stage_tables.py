@@ -1,12 +1,22 @@
-"""Tables of a study that describe the stage: plant, drive, sensor, disturbance."""
+"""Tables of a study that describe the stage: axes, drive, sensor, disturbance."""
 
 from typing import Annotated
 
 import numpy as np
 from pydantic import Field, model_validator
 
+from ..core.plain import shown
 from .file_tables import NoiseFile
-from .tables import ByAxis, Finite, NotNegative, Positive, Table, example, in_unit
+from .tables import (
+    ByAxis,
+    Finite,
+    NotNegative,
+    Positive,
+    Table,
+    example,
+    in_unit,
+    one_of,
+)
 
 Bandwidth = Annotated[float, Field(ge=1e-3, le=1e9, allow_inf_nan=False, strict=True)]
 Order = Annotated[int, Field(strict=True, ge=1, le=4)]
@@ -134,3 +144,33 @@ class DisturbanceTable(Table):
     input: NoiseFile | None = None
     """Measured noise, added to the voltage of the actuator; in V, or a unit that is
     converted to it."""
+
+
+class AxesTable(Table):
+    """Names and units of the axes of a multi-axis stage."""
+
+    model_config = example({"names": ["x", "y"], "units": ["um", "um"]})
+
+    names: tuple[str, ...] = Field(min_length=2)
+    """Names of the axes, of letters, digits and _; they differ in more than upper and
+    lower case."""
+    units: tuple[str, ...]
+    """Unit of each axis, um or urad."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "AxesTable":
+        if len(self.units) != len(self.names) or len(set(self.names)) < len(self.names):
+            raise ValueError("names must differ and have one unit each")
+        if len({name.casefold() for name in self.names}) < len(self.names):
+            raise ValueError(
+                f"names are {', '.join(self.names)}; they must differ in more than "
+                "upper and lower case, because files are named after them"
+            )
+        for unit in self.units:
+            one_of(unit, ("um", "urad"))
+        for name in self.names:
+            if not name.isidentifier():
+                raise ValueError(
+                    f"axis {shown(name)}: a name consists of letters, digits and _"
+                )
+        return self

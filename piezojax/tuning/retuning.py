@@ -18,7 +18,7 @@ from ..stages.of_study import motions_of
 from ..stages.try_gains import SMALL, abandoned
 from ..study import Case, Study, build, load, sha256_of
 from ..study.parameters import PART
-from ..study.schema import TunedTable
+from ..study.search_tables import TunedTable
 from .attempts import RETUNE_FILE, Attempt, RetuneReport
 from .outcome import Outcome
 from .result import GAINS_FILE
