@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import scipy
 from click.testing import CliRunner
 from oracles import excitation, forty_stages
 
@@ -157,6 +158,18 @@ def test_defaults_lie_within_the_record(record):
     assert np.ptp(reference) == pytest.approx(0.4 * np.ptp(moved), rel=1e-3)
 
 
+def test_the_default_references_are_as_slow_as_the_record(record):
+    time, drive, _ = lag_record()
+    slow = 40.0 - 30.0 * np.cos(2.0 * np.pi * 0.4 * time)
+    assert np.abs(np.diff(slow)).max() < 0.1 * np.abs(np.diff(drive)).max()
+    loaded = Record(slow, 0.1 * slow, 1e-3)
+    found = planned(loaded, {})
+    # 1.2 A 2 pi 4 f of PWSW is below 0.7 times the 7.5 um/s of the record.
+    assert (found.frequency, found.track) == (0.1, "SIN0.1,PWSW0.4")
+    assert found.slew < 0.7 * 0.1 * loaded.slews[0]
+    assert planned(loaded, {"frequency": 1.0}).track == "SIN1,PWSW4"
+
+
 def test_answers_replace_defaults(record):
     loaded = read_record(record, time="time_s", input=1, output=2)
     found = planned(loaded, {"frequency": 7.0, "upper": 50.0, "noise": None})
@@ -220,6 +233,15 @@ def test_answers_that_the_record_contradicts_are_doubted(record, given, message)
     else:
         (doubt,) = found
         assert re.search(message, doubt)
+
+
+def test_a_record_that_was_smoothed_is_doubted(record):
+    loaded = read_record(record, time="time_s", input=1, output=2)
+    low_pass = scipy.signal.butter(4, 0.05, output="sos")
+    smoothed = scipy.signal.sosfilt(low_pass, loaded.output - loaded.output[0])
+    quiet = Record(loaded.input, loaded.output[0] + smoothed, loaded.dt)
+    (doubt,) = doubts(planned(quiet, {}), quiet)
+    assert "less than that of any sensor: if the displacement was smoothed" in doubt
 
 
 def test_the_study_holds_the_answers_and_fits_the_record(record, tmp_path):

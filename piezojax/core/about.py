@@ -22,7 +22,8 @@ class About(BaseModel):
     the origin of the record of a fit, and ``rate_Hz`` the sampling rate. ``units`` maps
     the channels of the System to their units, and ``parameter_units`` its parameters,
     by path; "" is an unknown unit.
-    ``input_ranges`` are the least and greatest value of each input in the record.
+    ``input_ranges`` are the least and greatest value of each input in the record, and
+    ``input_slews`` the greatest change of each in a second.
     ``judged`` lists the margins that a controller was judged with, a sentence each,
     and ``plants`` the ranges of the plants on which they hold.
     ``actuator`` is the actuator that a controller was tuned with, as in a file of a
@@ -44,6 +45,7 @@ class About(BaseModel):
     units: dict[str, str] = {}
     parameter_units: dict[str, str] = {}
     input_ranges: list[tuple[float, float]] = []
+    input_slews: list[float] = []
     judged: list[str] = []
     plants: list[str] = []
     actuator: dict[str, Any] | None = None

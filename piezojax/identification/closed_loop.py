@@ -256,28 +256,40 @@ def _structure(model: str, record: Record) -> Structure:
     return structure(model, record, reach=WIDER)._replace(whitening=())
 
 
-def feedback_warnings(records: Sequence[Record], train: slice) -> list[str]:
-    """Return warnings about records of closed loops that were fitted as open ones."""
-    found = []
+_OPEN = (
+    "this fit is for open loops and biased towards -1 / controller where noise drives "
+    "the input: name the --reference of the loop, or fit a chain by --closed-loop "
+    "direct"
+)
+
+
+def feedback_warnings(
+    records: Sequence[Record], train: slice
+) -> tuple[list[str], list[str]]:
+    """Return alarms and notes on records of closed loops fitted as open ones.
+
+    An alarm is raised by a record without a reference or dither whose past outputs help
+    to predict its input.
+    """
+    alarms, notes = [], []
     for record in records:
         if (record.inputs.shape[1], record.outputs.shape[1]) != (1, 1):
             continue
         if record.closed_loop:
-            known = "its reference or dither shows that it"
-        else:
-            share = feedback_share(record.input[train], record.output[train])
-            if share < SHARE:
-                continue
-            known = (
-                f"past outputs explain {100.0 * share:.2g} % of the unpredictable part "
-                "of its input, which"
+            notes.append(
+                f"{record.source}: its reference or dither shows that it was made by "
+                f"feedback; {_OPEN}"
             )
-        found.append(
-            f"{record.source}: {known} was made by feedback; this fit is for open "
-            "loops and biased towards -1 / controller where noise drives the input: "
-            "name the --reference of the loop, or fit a chain by --closed-loop direct"
-        )
-    return found
+            continue
+        share = feedback_share(record.input[train], record.output[train])
+        if share >= SHARE:
+            alarms.append(
+                f"{record.source}: past outputs explain {100.0 * share:.2g} % of the "
+                "unpredictable part of its input. Either the output was smoothed by a "
+                "filter that looks ahead, which hides resonances: use the output as it "
+                f"was measured. Or the input was made by feedback: {_OPEN}"
+            )
+    return alarms, notes
 
 
 def without_noise(record: Record) -> Record:

@@ -151,6 +151,7 @@ class Fit:
                 (float(column.min()), float(column.max()))
                 for column in np.concatenate([one.inputs for one in self.records]).T
             ],
+            input_slews=np.max([one.slews for one in self.records], axis=0).tolist(),
             error_bound=None if residuals is None else residuals.error_bound,
             residual_rms=self.report.validation.each,
             standard_errors={
@@ -263,7 +264,7 @@ def identify(
         )
     estimate = chosen.estimate(model, records, train, options, progress or Silent())
     shown = estimate.shown or shown_dynamics(records, train)
-    feedback = [] if estimate.closed_loop else feedback_warnings(records, train)
+    feedback = ([], []) if estimate.closed_loop else feedback_warnings(records, train)
 
     def of_each(check: Callable[[Record], Iterable[str]]) -> list[str]:
         return [
@@ -274,6 +275,7 @@ def identify(
 
     runs = estimate.simulations
     alarms = of_each(plausibility_warnings)
+    alarms += feedback[0]
     alarms += _error_warnings(records, runs, validate)
     gains = ([], []) if held is None else held.gain_notes(records[0])
     alarms += gains[0]
@@ -297,7 +299,7 @@ def identify(
         residuals=residuals,
         warnings=[
             *alarms,
-            *feedback,
+            *feedback[1],
             *of_each(assumed_units),
             *of_each(checked),
             *estimate.warnings,

@@ -115,10 +115,12 @@ class KnownPlant:
         return dataclasses.replace(self, system=replace(fitted, others), held=True)
 
     def widened(self, about: About) -> About:
-        """Return the origin ``about`` of a new fit, with the known ranges of inputs."""
+        """Return the origin ``about`` of a new fit, with all that the inputs cover."""
         pairs = zip(about.input_ranges, self.about.input_ranges, strict=True)
         ranges = [(min(a[0], b[0]), max(a[1], b[1])) for a, b in pairs]
-        return about.model_copy(update={"input_ranges": ranges})
+        known = self.about.input_slews or [0.0] * len(ranges)
+        slews = [max(pair) for pair in zip(about.input_slews, known, strict=True)]
+        return about.model_copy(update={"input_ranges": ranges, "input_slews": slews})
 
     def _deviations(self, system: System, dt: float) -> dict[str, float]:
         """Return the standard deviations of the parameters of ``system`` by path."""

@@ -40,6 +40,7 @@ _DRIVE = {
     "noise_rms_V": ("noise on a constant reference, rms", "V"),
     "high_frequency_rms_V": ("above {high}, rms", "V"),
     "slew_rms_V_per_s": ("slew rate, rms", "V/s"),
+    "slew_peak_V_per_s": ("slew rate, peak", "V/s"),
     "current_rms_A": ("current, rms", "A"),
     "current_peak_A": ("current, peak", "A"),
     "power_W": ("power, mean of |u i|", "W"),

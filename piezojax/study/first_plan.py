@@ -25,11 +25,15 @@ PERIODS = 3
 FASTER = 1.2
 """Default limit of the slew, relative to the largest slew of the references."""
 
+RECORDED = 0.7
+"""Largest slew of the default references, as a share of that of the record, with the
+mean slope of the hysteresis loop: its local slopes are steeper."""
+
 BEYOND = 0.1
 """Share of the recorded range by which references or limits may exceed it."""
 
-NOISY = 0.05
-"""Share of the recorded span above which the given noise is doubtful."""
+NOISY, QUIET = 0.05, 3e-7
+"""Shares of the recorded span above and below which the noise is doubtful."""
 
 DEVICES: dict[str, dict[str, float | None]] = {
     "nv200": {"kp": None, "ki": None, "pcf_x": None, "notchf": 1.5, "notchb": 4.0},
@@ -129,30 +133,38 @@ def planned(record: Record, given: dict[str, Any]) -> Plan:
     Values of ``given`` that are not None replace the suggested ones. The limits are the
     lowest and highest recorded voltage, the noise comes from ``noise_rms``, and the
     references lie around the middle of the recorded displacements. The slowest has at
-    least ``SAMPLES_A_PERIOD`` samples in a period. The limit of the slew is ``FASTER``
-    times the largest slew of the references.
+    least ``SAMPLES_A_PERIOD`` samples in a period, and needs at most ``RECORDED`` times
+    the largest slew of the record. The limit of the slew is ``FASTER`` times the
+    largest slew of the references.
 
     Raises ValueError as ``Plan`` does, and for references outside the record.
     """
     known = {name: value for name, value in given.items() if value is not None}
     low, high = record.output.min(), record.output.max()
-    frequency = known.get(
-        "frequency", _round_below(1.0 / (SAMPLES_A_PERIOD * record.dt))
-    )
     amplitude = known.get("amplitude", _rounded(SHARE * (high - low)))
-    suggested = {
-        "lower": _rounded(float(record.input.min())),
-        "upper": _rounded(float(record.input.max())),
-        "noise": _rounded(noise_rms(record)),
-        "frequency": frequency,
-        "track": f"SIN{frequency:g},PWSW{4.0 * frequency:g}",
-        "amplitude": amplitude,
-        "offset": _rounded(0.5 * (low + high) - amplitude),
-        "slew": 1.0,  # until the references are known
-        "lowest": _rounded(float(low)),
-        "highest": _rounded(float(high)),
-    }
-    plan = Plan(**(suggested | known))
+
+    def plan_of(frequency: float) -> Plan:
+        suggested = {
+            "lower": _rounded(float(record.input.min())),
+            "upper": _rounded(float(record.input.max())),
+            "noise": _rounded(noise_rms(record)),
+            "frequency": frequency,
+            "track": f"SIN{frequency:g},PWSW{4.0 * frequency:g}",
+            "amplitude": amplitude,
+            "offset": _rounded(0.5 * (low + high) - amplitude),
+            "slew": 1.0,  # until the references are known
+            "lowest": _rounded(float(low)),
+            "highest": _rounded(float(high)),
+        }
+        return Plan(**(suggested | known))
+
+    highest = 1.0 / (SAMPLES_A_PERIOD * record.dt)
+    plan = plan_of(known.get("frequency", _round_below(highest)))
+    if "frequency" not in known:
+        recorded = RECORDED * record.slews[0] * record.span / np.ptp(record.input)
+        fastest = FASTER * _fastest(plan, record.dt)
+        if fastest > recorded:
+            plan = plan_of(_round_below(plan.frequency * recorded / fastest))
     if "slew" not in known:
         plan = replace(plan, slew=_rounded(FASTER * _fastest(plan, record.dt)))
     least, most = plan.offset, plan.offset + 2.0 * plan.amplitude
@@ -196,6 +208,13 @@ def doubts(plan: Plan, record: Record) -> list[str]:
         found.append(
             f"the record shows a noise of about {measured:.2g} um rms, more than the "
             f"{plan.noise:g} um given: the gains may amplify it"
+        )
+    if measured < QUIET * span:
+        found.append(
+            f"the record shows a noise of about {measured:.2g} um rms, less than that "
+            "of any sensor: if the displacement was smoothed before it was saved, use "
+            "it as it was measured, because smoothing hides resonances that make a "
+            "loop unstable"
         )
     if plan.controller in DEVICES and plan.scale == 0.0:
         found.append(

@@ -20,14 +20,15 @@ class Drive(BaseModel):
     - ``noise_rms_V``: standard deviation of u while the loop holds a constant
       reference, the first value of the first reference, under the sensor's noise alone;
     - ``high_frequency_rms_V``: rms of the part of u above ``HIGH`` times the rate;
-    - ``slew_rms_V_per_s``: rms of the slew rate, the change of u between two samples
-      over the sample time;
+    - ``slew_rms_V_per_s``, ``slew_peak_V_per_s``: rms and peak of the slew rate, the
+      change of u between two samples over the sample time;
     - ``current_rms_A``, ``current_peak_A``: the same slew rate times the capacitance C;
     - ``power_W``: mean of the absolute power u i, at which the stored energy C u^2 / 2
       changes.
 
     All but the first are the largest over the held-out references, each with its first
-    noise draw, from ``references.settle`` on; the peak is over the whole run. Figures
+    noise draw, from ``references.settle`` on; that of the current includes the time
+    before. Figures
     that need the capacitance are None without it, and all figures of a run that
     diverged are None.
     """
@@ -35,6 +36,7 @@ class Drive(BaseModel):
     noise_rms_V: float | None  # noqa: N815
     high_frequency_rms_V: float | None  # noqa: N815
     slew_rms_V_per_s: float | None  # noqa: N815
+    slew_peak_V_per_s: float | None = None  # noqa: N815
     current_rms_A: float | None = None  # noqa: N815
     current_peak_A: float | None = None  # noqa: N815
     power_W: float | None = None  # noqa: N815
@@ -58,6 +60,7 @@ def drive_of(
         "noise_rms_V": _largest([np.std(held[start:])]),
         "high_frequency_rms_V": _largest([_rms_above(run[start:]) for run in runs]),
         "slew_rms_V_per_s": slew,
+        "slew_peak_V_per_s": _largest([np.abs(each[start:]).max() for each in slews]),
     }
     if capacitance is not None and slew is not None:
         energies = [0.5 * capacitance * run[start:] ** 2 for run in runs]

@@ -1,18 +1,23 @@
 """Alarms for voltages of a study that the record of its plant does not cover."""
 
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..study import Case
 from .data import Data, holding_inputs, own_stage
 
+if TYPE_CHECKING:
+    from .outcome import Outcome
+
 COVERED = 0.25
 """Least ratio of the smaller to the larger of the ranges of record and actuator."""
 
 SLACK = 0.1
 """Share of the recorded range by which the references may leave it: hysteresis changes
-the input that holds a displacement by as much."""
+the input that holds a displacement by as much. Also the share by which the slew rate
+may exceed that of the record."""
 
 
 def recorded_range_alarms(case: Case, data: Data) -> Iterator[str]:
@@ -49,3 +54,28 @@ def recorded_range_alarms(case: Case, data: Data) -> Iterator[str]:
                 "range that is used, or set actuator.lower and actuator.upper to the "
                 "recorded range"
             )
+
+
+def recorded_slew_alarms(case: Case, outcome: "Outcome") -> Iterator[str]:
+    """Yield an alarm for each axis whose voltage moves faster than in the record.
+
+    An amplifier that cannot follow is not in the model then. A study that gives a slew
+    rate or a current limit of the amplifier simulates it, and has no alarm.
+    """
+    study, slews = case.study, case.plant_about.input_slews
+    limits = study.actuator.slew_rate, study.actuator.current_limit
+    if len(slews) != study.axis_count or limits != (None, None):
+        return
+    _, tuned = outcome.drive
+    for (name, drive), recorded in zip(tuned.items(), slews, strict=True):
+        peak = drive.slew_peak_V_per_s
+        if peak is None or peak <= (1.0 + SLACK) * recorded:
+            continue
+        of_axis = f" of axis {name}" if study.axes else ""
+        yield (
+            f"the tuned loop moves the voltage{of_axis} at up to {peak:.4g} V/s, but "
+            f"the record of the plant at most at {recorded:.4g} V/s: an amplifier that "
+            "cannot follow can make the loop unstable; set actuator.slew_rate to what "
+            "yours reaches, record faster motions (python -m piezojax.excite), or "
+            "limit constraints.peak_slew"
+        )

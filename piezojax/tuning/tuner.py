@@ -25,7 +25,7 @@ from .make_result import constraint_outcomes, make_result
 from .model_alarms import model_alarms
 from .outcome import Outcome
 from .reach import require_reach
-from .recorded_range import recorded_range_alarms
+from .recorded_range import recorded_range_alarms, recorded_slew_alarms
 from .response_margins import margins_on_response, response_alarms
 from .sliding import sliding_share
 from .structure_search import search_structures
@@ -125,13 +125,14 @@ def _tuned(
     result.warnings += peak_notes(stability)
     limits = table.limits
     result.on_response = margins_on_response(case, stability)
+    outcome = Outcome(result, case.loop, after, case, data.holdout, None, stability)
     of_model = [
         *response_alarms(result.on_response, limits, stability),
         *_model_alarms(case, limits, stability),
         *recorded_range_alarms(case, data),
+        *recorded_slew_alarms(case, outcome),
         *device_alarms(after.controller),
     ]
-    outcome = Outcome(result, case.loop, after, case, data.holdout, None, stability)
     result.steps_before, result.steps = outcome.steps
     result.alarms = alarms_of(result, stability, limits, of_model)
     result.wall_s = clock.wall_s()

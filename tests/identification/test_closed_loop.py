@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy
 from click.testing import CliRunner
 from oracles import closed_loop as oracle
 from oracles import resonant_records
@@ -20,6 +21,7 @@ from piezojax.core.progress import Silent
 from piezojax.core.system import Affine
 from piezojax.dynamics import Mode, Notch
 from piezojax.identification import Options, average_periods, closed_loop
+from piezojax.identification.closed_loop import feedback_warnings
 from piezojax.identification.estimators.controlled_stage import (
     ControlledStage,
     loop_drive,
@@ -202,6 +204,19 @@ def test_feedback_is_seen():
     assert feedback_share(record.input[:999], record.output[:999]) == 0.0
 
 
+def test_an_output_that_was_smoothed_looking_ahead_is_seen():
+    case = resonant_records.grid()[0]._replace(seconds=0.5)
+    input, output = resonant_records.measured(case)
+    assert feedback_share(input, output) == 0.0
+    low_pass = scipy.signal.butter(4, 0.12, output="sos")
+    smoothed = scipy.signal.sosfiltfilt(low_pass, output)
+    record = Record(input, smoothed, 1.0 / resonant_records.RATE, source="bench.csv")
+    (alarm,), notes = feedback_warnings([record], slice(0, record.samples))
+    assert alarm.startswith("bench.csv: past outputs explain ")
+    assert "smoothed by a filter that looks ahead, which hides resonances" in alarm
+    assert notes == []
+
+
 def test_open_loops_with_hysteresis_are_not_taken_for_feedback():
     for case in resonant_records.grid()[:5:2]:
         input, output = resonant_records.measured(case._replace(seconds=0.2))
@@ -310,6 +325,7 @@ def test_a_fit_for_open_loops_is_biased_and_says_so():
     (warning,) = [text for text in found.report.warnings if "feedback" in text]
     assert "past outputs explain" in warning
     assert "biased towards -1 / controller" in warning
+    assert warning in found.report.alarms
 
 
 def test_noise_that_the_model_does_not_whiten_leads_to_joint():

@@ -96,6 +96,8 @@ def test_the_figures_are_of_the_hold_out_behind_the_amplifier(outcome):
     expected = max(np.sqrt(np.mean(slew**2)) for slew in slews)
     assert found.slew_rms_V_per_s == pytest.approx(expected, rel=1e-9)
     assert found.current_rms_A == pytest.approx(3e-6 * expected, rel=1e-9)
+    highest = max(np.abs(slew).max() for slew in slews)
+    assert found.slew_peak_V_per_s == pytest.approx(highest, rel=1e-9)
 
 
 def test_the_noise_equals_the_closed_form(outcome):
@@ -126,7 +128,7 @@ def test_the_figures_are_in_the_file_and_in_the_table(outcome, tmp_path):
     table = drive_table(outcome.drive, 2e4, has_capacitance=True)
     titles = list(table.columns[0].cells)
     assert titles[1] == "above 2000 Hz, rms"
-    assert len(titles) == 6
+    assert len(titles) == 7
     noise = outcome.drive[1]["piezo"].noise_rms_V
     assert next(iter(table.columns[2].cells)) == f"{noise:.3g}"
 
@@ -135,11 +137,12 @@ def test_figures_that_need_a_capacitance_are_omitted_without_one():
     drive = Drive(noise_rms_V=0.1, high_frequency_rms_V=None, slew_rms_V_per_s=2.0)
     both = {"x": drive, "y": drive}
     table = drive_table((both, both), 1e4, has_capacitance=False)
-    assert list(table.columns[0].cells)[::3] == [
+    assert list(table.columns[0].cells)[::4] == [
         "x, noise on a constant reference, rms",
         "y, noise on a constant reference, rms",
     ]
-    assert list(table.columns[1].cells)[:3] == ["0.1", "diverges", "2"]
+    shown = list(table.columns[1].cells)[:4]
+    assert shown == ["0.1", "diverges", "2", "diverges"]
 
 
 def test_currents_of_diverged_loops_are_in_the_table():
@@ -149,4 +152,4 @@ def test_currents_of_diverged_loops_are_in_the_table():
         )
     }
     table = drive_table((lost, lost), 1e4, has_capacitance=True)
-    assert list(table.columns[2].cells) == ["diverges"] * 6
+    assert list(table.columns[2].cells) == ["diverges"] * 7

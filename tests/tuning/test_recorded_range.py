@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+from types import SimpleNamespace
 
 import pytest
 
@@ -9,7 +10,13 @@ import piezojax as pj
 from piezojax.core.about import About
 from piezojax.study import Study, build
 from piezojax.tuning.data import make_data
-from piezojax.tuning.recorded_range import COVERED, SLACK, recorded_range_alarms
+from piezojax.tuning.drive import Drive
+from piezojax.tuning.recorded_range import (
+    COVERED,
+    SLACK,
+    recorded_range_alarms,
+    recorded_slew_alarms,
+)
 
 # 2 um/V: references from -40 to 60 um need -20 to 30 V.
 PLANT = {"type": "Affine", "gain": 2.0, "offset": 0.0}
@@ -119,3 +126,47 @@ def test_tuning_ends_with_the_alarm():
         "fitted to bench.csv and never checked on a second record" in note
         for note in result.warnings
     )
+
+
+def slew_alarms(recorded, *peaks, **tables):
+    about = About(input_slews=list(recorded))
+    case = dataclasses.replace(case_of(**tables), plant_about=about)
+    names = case.study.axes.names if case.study.axes else ("piezo",)
+    figures = {
+        name: Drive(
+            noise_rms_V=0.0,
+            high_frequency_rms_V=0.0,
+            slew_rms_V_per_s=0.0,
+            slew_peak_V_per_s=peak,
+        )
+        for name, peak in zip(names, peaks, strict=True)
+    }
+    return list(recorded_slew_alarms(case, SimpleNamespace(drive=({}, figures))))
+
+
+def test_a_voltage_that_is_faster_than_the_record_raises_an_alarm():
+    assert slew_alarms([1000.0], 1000.0 * (1.0 + 0.9 * SLACK)) == []
+    assert slew_alarms([1000.0], 2500.0) == [
+        "the tuned loop moves the voltage at up to 2500 V/s, but the record of the "
+        "plant at most at 1000 V/s: an amplifier that cannot follow can make the loop "
+        "unstable; set actuator.slew_rate to what yours reaches, record faster motions "
+        "(python -m piezojax.excite), or limit constraints.peak_slew"
+    ]
+    assert slew_alarms([1000.0], None) == []  # a diverging run has its own alarm
+    (alarm,) = slew_alarms([10.0, 1000.0], 10.0, 1200.0, **AXES)
+    assert alarm.startswith("the tuned loop moves the voltage of axis Rx at up to 1200")
+
+
+def test_an_amplifier_in_the_study_may_be_faster_than_the_record():
+    limits = STUDY["actuator"] | {"slew_rate": 2500.0}
+    assert slew_alarms([1000.0], 2500.0, actuator=limits) == []
+    limits = STUDY["actuator"] | {"current_limit": 0.1, "capacitance": 3e-6}
+    assert slew_alarms([1000.0], 2500.0, actuator=limits) == []
+    assert slew_alarms([], 2500.0) == []  # a plant without a fit
+
+
+def test_a_tuned_loop_that_is_faster_than_the_record_has_the_alarm():
+    about = About(input_ranges=[(-20.0, 120.0)], input_slews=[300.0])
+    case = dataclasses.replace(case_of(), plant_about=about)
+    (alarm,) = pj.tune(case).result.alarms
+    assert alarm.startswith("the tuned loop moves the voltage at up to ")

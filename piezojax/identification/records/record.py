@@ -194,6 +194,11 @@ class Record:
         """Range of the only output, largest minus smallest value."""
         return float(np.ptp(self.output))
 
+    @property
+    def slews(self) -> np.ndarray:
+        """Largest change of each input [m] between two samples, in its unit per s."""
+        return np.abs(np.diff(self.inputs, axis=0)).max(axis=0) / self.dt
+
     def in_units(
         self, input_units: Sequence[str], output_units: Sequence[str]
     ) -> "Record":
