@@ -119,6 +119,7 @@ def line_of(number, dialect, record_of, options=()):
     )
     return line | {
         "alarms": result.alarms,
+        "notes": result.warnings,
         "promised": said,
         "obtained": got,
         "ratio": got / said,

@@ -11,7 +11,7 @@ import pytest
 import scipy
 from click.testing import CliRunner
 from oracles import closed_loop as oracle
-from oracles import resonant_records
+from oracles import excitation, forty_stages, resonant_records
 
 import piezojax as pj
 from piezojax import Record, identify, read_record
@@ -215,6 +215,12 @@ def test_an_output_that_was_smoothed_looking_ahead_is_seen():
     assert alarm.startswith("bench.csv: past outputs explain ")
     assert "smoothed by a filter that looks ahead, which hides resonances" in alarm
     assert notes == []
+    # A voltage without noise is predicted so well that past outputs help a little.
+    slow = forty_stages.stage(3)
+    drive, moved = excitation.record(slow)
+    record = Record(drive, moved, slow.dt, source="slow.csv")
+    alarms, notes = feedback_warnings([record], slice(0, record.samples // 2))
+    assert (alarms, len(notes)) == ([], 1)
 
 
 def test_open_loops_with_hysteresis_are_not_taken_for_feedback():
@@ -325,7 +331,6 @@ def test_a_fit_for_open_loops_is_biased_and_says_so():
     (warning,) = [text for text in found.report.warnings if "feedback" in text]
     assert "past outputs explain" in warning
     assert "biased towards -1 / controller" in warning
-    assert warning in found.report.alarms
 
 
 def test_noise_that_the_model_does_not_whiten_leads_to_joint():
