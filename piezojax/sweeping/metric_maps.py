@@ -12,6 +12,9 @@ if TYPE_CHECKING:
 
 _BEYOND = 1e3  # factor on the median; points with larger values count as lost
 
+PEAK = "sensitivity_peak"
+"""Metric that is infinite for an unstable loop: one whose runs may still look good."""
+
 
 class MetricMap(NamedTuple):
     """A metric by point for one plant and axis, averaged over references and draws.
@@ -60,7 +63,10 @@ def averaging(name: str) -> str:
 
 
 def metric_maps(dataset: "Dataset", name: str) -> list[MetricMap]:
-    """Return a metric by point, for each plant and axis."""
+    """Return a metric by point, for each plant and axis.
+
+    It is NaN where the sensitivity peak, if it is a metric of the sweep, is infinite.
+    """
     variable = dataset[name]
     others = [d for d in ("plant", "axis") if d in variable.dims]
     found = []
@@ -70,8 +76,20 @@ def metric_maps(dataset: "Dataset", name: str) -> list[MetricMap]:
         if "axis" in chosen:
             unit = str(dataset["axis_unit"].values[chosen["axis"]])
         title = ", ".join(str(dataset[d].values[i]) for d, i in chosen.items())
-        found.append(MetricMap(title, _mean(variable.isel(chosen), name), unit))
+        values = np.where(
+            _unstable(dataset, chosen), np.nan, _mean(variable.isel(chosen), name)
+        )
+        found.append(MetricMap(title, values, unit))
     return found
+
+
+def _unstable(dataset: "Dataset", chosen: dict[str, int]) -> np.ndarray:
+    """Return the points with an infinite sensitivity peak; none without that metric."""
+    if PEAK not in dataset:
+        return np.array(False)
+    peak = dataset[PEAK]
+    peak = peak.isel({d: i for d, i in chosen.items() if d in peak.dims})
+    return ~np.isfinite(peak.values)
 
 
 def _mean(variable: Any, name: str) -> np.ndarray:
