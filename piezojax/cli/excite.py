@@ -1,11 +1,15 @@
 """``python -m piezojax.excite [RESULTS]``: voltages to record."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from .command import Command, common, print_loading, print_results, results_folder, run
 from .terminal import Bar
+
+if TYPE_CHECKING:
+    from ..study import Case
 
 RECORD, DESIGNED = "record.csv", "designed.csv"
 """File names of a whole record, and of a designed one for a small buffer."""
@@ -66,8 +70,9 @@ def main(results, duration, points, out, seed, quiet, **limits):
 
     With RESULTS, a folder of tune with a fitted plant, the voltages are designed for
     this plant and these gains: they make the errors of the promised figures small that
-    the errors of the plant cause. Limits and rate are those of its study by default.
-    Ctrl-C ends their search, and keeps the best ones so far.
+    the errors of the plant cause. Limits and rate are those of its study by default,
+    and the slew rate is that of the amplifier in the study, or of the record. Ctrl-C
+    ends their search, and keeps the best ones so far.
     """
 
     def body(console):
@@ -113,6 +118,24 @@ def _write_usual(limits, points, out, seed, console):
     print_results(page, folder, console)
 
 
+def known_slew(case: "Case") -> float:
+    """Return the slew rate of the amplifier in the study, or that of the record, V/s.
+
+    Raises ValueError if neither is known.
+    """
+    from ..study.make_hardware import slew_rate
+
+    found = slew_rate(case.study, 0)
+    if found is None and case.plant_about.input_slews:
+        found = case.plant_about.input_slews[0]
+    if found is None:
+        raise ValueError(
+            "--slew is missing, and neither the study (actuator.slew_rate) nor the "
+            "record of the plant tells how fast the amplifier is"
+        )
+    return found
+
+
 def _write_designed(results, limits, duration, points, out, seed, console):
     """Write the voltages designed for the gains and the plant in ``results``."""
     print_loading(console)
@@ -131,6 +154,7 @@ def _write_designed(results, limits, duration, points, out, seed, console):
             "lower": bounds.lower,
             "upper": bounds.upper,
             "rate": case.study.rate,
+            "slew": limits.get("slew") or known_slew(case),
         }
         generator = Generator(**(of_study | limits))
         samples = points or round((duration or SECONDS) * generator.rate)

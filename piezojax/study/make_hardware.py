@@ -34,7 +34,7 @@ def make_actuator(study: Study) -> System:
     def parts(axis: int) -> Parts:
         lower, upper = _of(table.lower, axis), _of(table.upper, axis)
         found: Parts = {"limits": Saturation(lower, upper)}
-        rate = _slew_rate(study, axis)
+        rate = slew_rate(study, axis)
         if rate is not None:
             found["slew"] = SlewLimit(rate, study.dt)
         return found | _converter(study, table, axis, upper - lower)
@@ -103,8 +103,11 @@ def _of(value: Any, axis: int) -> Any:
     return value[axis] if isinstance(value, tuple) else value
 
 
-def _slew_rate(study: Study, axis: int) -> float | None:
-    """Return the lower of the slew rate and the current over the capacitance, V/s."""
+def slew_rate(study: Study, axis: int) -> float | None:
+    """Return the lower of the slew rate and the current over the capacitance, V/s.
+
+    None if the study limits neither.
+    """
     table = study.actuator
     current = _of(table.current_limit, axis)
     rates = [_of(table.slew_rate, axis)]

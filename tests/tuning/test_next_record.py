@@ -17,6 +17,7 @@ from small_runs import call, succeeded
 from study_tables import with_values
 
 import piezojax as pj
+from piezojax.cli.excite import known_slew
 from piezojax.core.feedback import loop_inputs
 from piezojax.core.progress import Silent
 from piezojax.core.rollout import simulate
@@ -77,6 +78,7 @@ def write_study(folder, changes=None, errors=0.01):
     about = pj.About(
         record="bench.csv",
         rate_Hz=RATE,
+        input_slews=[2e4],
         units={"input": "V", "output": "um"},
         parameter_units={path: "rad/s" for path in TRUE if "frequency" in path},
         standard_errors=known | {"calibration.offset": 0.1} if errors else {},
@@ -470,6 +472,7 @@ def test_the_command_fills_a_buffer(results, tmp_path):
     assert not (out / "record.csv").exists()
     rows = np.loadtxt(out / "designed.csv", delimiter=",", skiprows=1)
     assert len(rows) <= 256
+    assert RATE * np.abs(np.diff(rows[:, 1])).max() <= 2e4 * (1.0 + 1e-6)
     plant = tmp_path / "model.json"
     plant.write_text(plant.read_text(encoding="utf-8") + "\n", encoding="utf-8")
     refused = call("excite", results, "--out", tmp_path / "other")
@@ -477,6 +480,15 @@ def test_the_command_fills_a_buffer(results, tmp_path):
     assert "or a file that it names has changed since: the SHA-256 differs" in (
         refused.stderr
     )
+
+
+def test_the_slew_rate_is_that_of_the_amplifier_or_of_the_record(case):
+    assert known_slew(case) == 2e4
+    limits = case.study.actuator.model_copy(update={"slew_rate": 3e3})
+    study = case.study.model_copy(update={"actuator": limits})
+    assert known_slew(dataclasses.replace(case, study=study)) == 3e3
+    with pytest.raises(ValueError, match="--slew is missing, and neither the study"):
+        known_slew(dataclasses.replace(case, plant_about=pj.About()))
 
 
 def test_a_record_must_be_longer_than_its_move_back(case):
