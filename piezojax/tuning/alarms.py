@@ -25,6 +25,9 @@ from that of tuning."""
 AMPLIFIED = 2.0
 """Largest peak of |y/r| without a note."""
 
+DISAGREE = 5.0
+"""Ratio of the errors on the hold-out to those of tuning without an alarm."""
+
 OVERSHOOT = 1.0
 """Largest overshoot of a large step without an alarm, as a share of its height. A
 larger one leaves the range in which the model was tested, or that of the stage."""
@@ -55,6 +58,7 @@ def alarms_of(
     others = _not_exact(result.constraints, stability)
     return [
         *_run_alarms(scores),
+        *_disagreement(result.after, result.holdout),
         *_stability_alarms(stability, limits),
         *_limit_alarms(others, result.perturbed),
         *_holdout_alarms(result.holdout_constraints),
@@ -94,6 +98,18 @@ def _run_alarms(scores: Mapping[str, Scores | None]) -> Iterable[str]:
                     f"the tuned loop {what} on {where} runs of {', '.join(names)}: "
                     f"reduce the amplitude of the references, or {_TIGHTEN}"
                 )
+
+
+def _disagreement(tuning: Scores, holdout: Scores) -> Iterable[str]:
+    """Yield an alarm if the hold-out has far larger errors than the tuning."""
+    known, found = tuning.geomean_rms_um, holdout.geomean_rms_um
+    if known and found and found > DISAGREE * known:
+        yield (
+            f"the errors on the hold-out are {found / known:.3g} times those of tuning:"
+            " the gains suit only the noise and residual that they were tuned with; if "
+            "the plant is fitted to a record, record the same motions in both halves "
+            "(python -m piezojax.excite writes such voltages)"
+        )
 
 
 def _stability_alarms(

@@ -16,7 +16,7 @@ from piezojax.analysis.stability.conserved import LinearAxes, LinearLoop
 from piezojax.analysis.stability.following import Following
 from piezojax.cli.tune import main
 from piezojax.core.files import write_json
-from piezojax.tuning.alarms import alarms_of, exact_peak
+from piezojax.tuning.alarms import DISAGREE, alarms_of, exact_peak
 from piezojax.tuning.result import ConstraintOutcome, Perturbed, Result, Scores
 from piezojax.tuning.step_tests import StepResult
 
@@ -86,6 +86,7 @@ def changed(**changes):
 
 
 def test_safe_gains_raise_no_alarm():
+    assert alarms(changed(holdout=scores(rms=0.99 * DISAGREE))) == []
     kept = {"sensitivity_peak": outcome("sensitivity_peak", [1.4, 1.9], 2.0)}
     assert alarms(changed(constraints=kept, perturbed=perturbed(**kept))) == []
     # The hold-out has another noise draw.
@@ -183,6 +184,10 @@ def test_the_heading_counts_the_alarms(alarms, heading):
             "stays at a voltage limit on hold-out runs of SW30: reduce",
         ),
         ({"unseen": scores(rms=None)}, "diverges on unseen runs of SW30"),
+        (
+            {"holdout": scores(rms=1.01 * DISAGREE)},
+            "the errors on the hold-out are 5.05 times those of tuning: the gains suit",
+        ),
         ({"coupling": scores(rms=None)}, "diverges on resting runs of SW30"),
         (
             {"holdout_constraints": {"effort": outcome("effort", [53.0], 50.0)}},
