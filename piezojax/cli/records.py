@@ -100,7 +100,8 @@ def print_columns(console: Console, records: Iterable["Record"]) -> None:
         )
         console.print(
             f"read {record.source}: {sides}; {record.samples} samples at "
-            f"{1.0 / record.dt:.6g} Hz",
+            f"{1.0 / record.dt:.6g} Hz"
+            + (f" ({record.clock!r} in s, assumed)" if record.clock else ""),
             soft_wrap=True,
             markup=False,
         )

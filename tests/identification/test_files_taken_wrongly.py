@@ -47,6 +47,15 @@ def test_a_unit_that_is_not_stated_is_noted(tmp_path):
     record = read_record(path, input="drive", output="counts")
     assert record.assumed == ("drive", "counts")
     assert assumed_units(Record(DRIVE, DRIVE, 1e-3)) == []
+    path = tmp_path / "bench.csv"
+    columns = np.c_[np.arange(DRIVE.size), DRIVE, 0.1 * DRIVE]
+    np.savetxt(path, columns, delimiter=",", header="time,drive_V,z_um", comments="")
+    record = read_record(path, time="time", input="drive_V", output="z_um")
+    assert (record.clock, record.dt) == ("time", 1.0)
+    assert assumed_units(record) == [
+        "the unit of column 'time' is not stated; s is assumed: name the column with "
+        "its unit, as time_s"
+    ]
 
 
 @pytest.mark.parametrize(

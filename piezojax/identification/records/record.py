@@ -34,7 +34,7 @@ class Record:
     messages, ``period`` the number of samples in a period of a periodic input;
     ``input_names`` and ``output_names`` are those of the columns in a file, ``assumed``
     those whose unit neither the file nor their name states: they are taken to be in V
-    and um.
+    and um. ``clock`` is the time column if its unit is not stated; it is taken as s.
 
     A record of a closed loop may hold its excitation: the ``reference`` [samples] in
     the unit of the output, and the ``dither`` [samples] in that of the input, which is
@@ -56,6 +56,7 @@ class Record:
     input_names: tuple[str, ...] = ()
     output_names: tuple[str, ...] = ()
     assumed: tuple[str, ...] = ()
+    clock: str = ""
     reference: np.ndarray | None = None
     dither: np.ndarray | None = None
 
@@ -310,6 +311,7 @@ def read_record(
         input_names=tuple(inputs),
         output_names=tuple(outputs),
         assumed=tuple(n for n in (*inputs, *outputs) if read.units[n] is None),
+        clock=read.clock,
         **{
             role: _converted(read, role, of[0], path)
             for role, of in (("reference", outputs), ("dither", inputs))

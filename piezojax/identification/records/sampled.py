@@ -34,7 +34,8 @@ class Sampled(NamedTuple):
     """Columns of a file by their names, with units (None if unknown) and instants.
 
     ``names`` are the columns of each role. ``instants`` [samples] in s are those of the
-    time column, or from 0 without one; ``dt`` (s) is their mean step.
+    time column, or from 0 without one; ``dt`` (s) is their mean step. ``clock`` is the
+    name of a time column without a unit, "" otherwise.
     """
 
     names: dict[str, list[str]]
@@ -42,6 +43,7 @@ class Sampled(NamedTuple):
     units: dict[str, str | None]
     instants: np.ndarray
     dt: float
+    clock: str
 
     def matrix(self, role: str) -> np.ndarray:
         """Return the columns of ``role``, [samples, columns]."""
@@ -98,7 +100,8 @@ def read_sampled(
     if instants is None:
         instants = dt * np.arange(values[signals[0]].size)
     units = {name: unit_of(name, columns[name]) for name in signals}
-    return Sampled(names, values, units, instants, dt)
+    bare = [name for name in clock if unit_of(name, columns[name]) is None]
+    return Sampled(names, values, units, instants, dt, "".join(bare))
 
 
 def read_plain_columns(

@@ -117,10 +117,9 @@ def model_faults(
     return Faults(
         bound,
         peaks,
-        [*_peak_warnings(gross)],
+        [*_peak_warnings(gross), *([] if peaks else _response_warnings(errors))],
         [
             *_peak_warnings(peak for peak in peaks if peak.times_gain <= GROSS),
-            *([] if peaks else _response_warnings(errors)),
             *_gain_warnings(records, runs, part),
         ],
     )
@@ -169,8 +168,9 @@ def _response_warnings(errors: Iterable[RelativeError]) -> Iterator[str]:
     if wrong:
         yield (
             f"from {min(wrong):.4g} Hz on the model is wrong by more than "
-            "its own gain: its dynamics are too simple; fit a model with a mode, a "
-            "lag or a delay (--model ...+mode+lag+delay) before tuning"
+            "its own gain. If its dynamics are too simple, fit a model with a mode, a "
+            "lag or a delay (--model ...+mode+lag+delay) before tuning; if the output "
+            "was smoothed after it was measured, use it as it was measured"
         )
 
 
