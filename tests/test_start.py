@@ -518,6 +518,15 @@ def test_a_changed_record_is_tuned_again(run, tmp_path, record):
     assert f"the gains are in {tmp_path / 'out' / 'tuned'}\n" in output
 
 
+def test_the_same_command_goes_on(run):
+    options = "--yes", "--upper", "60", "--controller", "inversion_pid", "--seed", "2"
+    _, _, calls = run(*options)
+    assert len(calls) == 2
+    status, output, calls = run(*options)
+    assert (status, calls) == (0, [])
+    assert "tuned before: the gains are in" in output
+
+
 def test_answers_to_a_study_that_is_written_are_refused(run, tmp_path, record):
     run("--yes")
     status, output, calls = run("--upper", "50", "--seed", "3")

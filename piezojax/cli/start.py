@@ -106,12 +106,12 @@ def main(record, model, check, yes, sliders, out, seed, quiet, **given):
 
         folder = out or numbered_folder(RESULTS / record.stem)
         study = folder / STUDY
+        options = {"model": model, "check": check, "seed": seed}
         if study.is_file():
-            others = {"model": model, "check": check, "seed": seed}
-            _check_same(study, record, given | others)
+            _check_same(study, record, given, options)
             console.print(f"going on in {folder} with its {STUDY}", soft_wrap=True)
         else:
-            _write_study(study, record, given, model, check, yes, seed, console)
+            _write_study(study, record, given, options, yes, console)
         tuned, outcome = _finished(study, console), None
         if tuned is None:
             tuned = numbered_folder(folder / TUNED)
@@ -145,38 +145,20 @@ def _write_study(
     study: Path,
     record: Path,
     given: dict[str, Any],
-    model: str | None,
-    check: Path | None,
+    options: dict[str, Any],
     yes: bool,
-    seed: int | None,
     console: Console,
 ) -> None:
     """Write the first ``study`` of ``record``; ask the ``QUESTIONS`` unless ``yes``."""
     from ..core.files import fresh_folder
-    from ..identification import DEFAULT
-    from ..identification.records.recognise import recognised
-    from ..identification.records.record import read_record
     from ..study.first_plan import doubts, planned
-    from ..study.first_study import first_study
 
-    asked = {name: given[name] for name in QUESTIONS}
-    columns = recognised(
-        record, {name: value for name, value in given.items() if name not in QUESTIONS}
-    )
-    loaded = read_record(record, **columns)
+    loaded, columns = _read(record, given)
     print_columns(console, [loaded])
     in_units = loaded.in_units(("V",), ("um",))
+    asked = {name: given[name] for name in QUESTIONS}
     plan = planned(in_units, asked) if yes else _asked(in_units, asked)
-    text = first_study(
-        plan,
-        record,
-        columns,
-        1.0 / loaded.dt,
-        folder=study.parent,
-        model=model or DEFAULT,
-        check=check,
-        seed=seed or 0,
-    )
+    text = _text_of(study, record, loaded, columns, plan, options)
     fresh_folder(study.parent)
     write_text(study, text)
     for name, question in QUESTIONS.items():
@@ -185,6 +167,41 @@ def _write_study(
     for doubt in doubts(plan, in_units):
         console.print(f"note: {doubt}", soft_wrap=True)
     console.print(f"wrote {study}", soft_wrap=True)
+
+
+def _read(record: Path, given: dict[str, Any]) -> "tuple[Record, dict[str, Any]]":
+    """Return the Record in the file ``record``, and the columns that it was read by."""
+    from ..identification.records.recognise import recognised
+    from ..identification.records.record import read_record
+
+    columns = recognised(
+        record, {name: value for name, value in given.items() if name not in QUESTIONS}
+    )
+    return read_record(record, **columns), columns
+
+
+def _text_of(
+    study: Path,
+    record: Path,
+    loaded: "Record",
+    columns: dict[str, Any],
+    plan: "Plan",
+    options: dict[str, Any],
+) -> str:
+    """Return the text of the ``study`` of ``plan``; ``options`` are those of main."""
+    from ..identification import DEFAULT
+    from ..study.first_study import first_study
+
+    return first_study(
+        plan,
+        record,
+        columns,
+        1.0 / loaded.dt,
+        folder=study.parent,
+        model=options["model"] or DEFAULT,
+        check=options["check"],
+        seed=options["seed"] or 0,
+    )
 
 
 def _asked(record: "Record", given: dict[str, Any]) -> "Plan":
@@ -220,19 +237,30 @@ def _concerns(name: str, plan: "Plan") -> bool:
     return name not in OF_DEVICES or plan.controller in DEVICES
 
 
-def _check_same(study: Path, record: Path, given: dict[str, Any]) -> None:
-    """Raise ValueError if ``study`` has another record, or an option is ``given``.
+def _check_same(
+    study: Path, record: Path, given: dict[str, Any], options: dict[str, Any]
+) -> None:
+    """Raise ValueError if ``study`` has another record, or follows other options.
 
-    A study that exists is tuned as it is and follows no options.
+    A study that exists is tuned as it is. Options are accepted if they would write it.
     """
     from ..core.files import seen_from
     from ..study import load
+    from ..study.first_plan import planned
 
     known = load(study).plant.get("record", [])  # a study may name a model instead
     known = known if isinstance(known, list) else [known]
-    named = [f"--{name}" for name, value in given.items() if value is not None]
+    every = given | options
+    named = [f"--{name}" for name, value in every.items() if value is not None]
     if seen_from(study.parent, record) not in known:
         named = [str(record)]
+    elif named:
+        loaded, columns = _read(record, given)
+        asked = {name: given[name] for name in QUESTIONS}
+        plan = planned(loaded.in_units(("V",), ("um",)), asked)
+        text = _text_of(study, record, loaded, columns, plan, options)
+        if text == study.read_text(encoding="utf-8"):
+            return
     if named:
         raise ValueError(
             f"{study} was written before and does not follow {', '.join(named)}: edit "
