@@ -222,6 +222,7 @@ def test_impossible_answers_are_refused(record, given, message):
         ({"upper": 90.0}, "the voltage may reach .* to 90 V, but the record covers"),
         ({"lower": -9.0}, "outside it the model extrapolates"),
         ({"noise": 1.0}, "a noise of 1 um rms is .* % of the recorded span: is it in"),
+        ({"noise": 0.25}, "shows a noise of about 0.0.* um rms, and 0.25 um are"),
         ({"noise": 0.0}, "the record shows a noise of about 0.0.* um rms, more than"),
     ],
 )

@@ -35,6 +35,9 @@ BEYOND = 0.1
 NOISY, QUIET = 0.05, 3e-7
 """Shares of the recorded span above and below which the noise is doubtful."""
 
+LOUD = 20.0
+"""Ratio of the given noise to the recorded one above which it is doubtful."""
+
 DEVICES: dict[str, dict[str, float | None]] = {
     "nv200": {"kp": None, "ki": None, "pcf_x": None, "notchf": 1.5, "notchb": 4.0},
     "e727": {
@@ -203,6 +206,11 @@ def doubts(plan: Plan, record: Record) -> list[str]:
         found.append(
             f"a noise of {plan.noise:g} um rms is {100.0 * plan.noise / span:.3g} % of "
             "the recorded span: is it in um, and the rms value?"
+        )
+    elif plan.noise > LOUD * measured:
+        found.append(
+            f"the record shows a noise of about {measured:.2g} um rms, and "
+            f"{plan.noise:g} um are given: are they in um?"
         )
     elif plan.noise < 0.1 * measured:
         found.append(

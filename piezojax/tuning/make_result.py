@@ -104,7 +104,7 @@ def make_result(
             *case.notes,
             *search.warnings,
             *_warnings(case, bounds_reached, after_scores, holdout),
-            *worse_than_the_start(_chosen(before, names, tuned), after_scores),
+            *not_better_than_the_start(_chosen(before, names, tuned), after_scores),
         ],
         history=search.losses_by_start,
         times_s=search.times_s,
@@ -117,7 +117,9 @@ def make_result(
 
 
 WORSE = 1e-3
-"""Relative excess over the error of the start that does not count."""
+"""Relative difference from the error of the start that does not count."""
+
+_LONGER = "to search longer, raise 'candidates', 'starts' and 'steps'"
 
 EDGE = 1e-2
 """Distance, as a share of the range, within which a gain is at a bound."""
@@ -237,15 +239,17 @@ def _residual_notes(case: Case) -> list[str]:
     ]
 
 
-def worse_than_the_start(before: Scores, after: Scores) -> list[str]:
-    """Return a note if gains within the limits track worse than the start."""
+def not_better_than_the_start(before: Scores, after: Scores) -> list[str]:
+    """Return a note if gains within the limits track not better than the start."""
     if not (before.stable and after.stable):
         return []
     was, found = before.geomean_rms_um, after.geomean_rms_um
-    if was is None or found is None or found <= was * (1.0 + WORSE):
+    if was is None or found is None or found < was * (1.0 - WORSE):
         return []
+    if found <= was * (1.0 + WORSE):
+        return [f"the search found no gains that are better than the start: {_LONGER}"]
     return [
         f"the tuned gains track worse than the start, {1e3 * found:.4g} nm against "
         f"{1e3 * was:.4g} nm: the start does not keep the limits, or fails on a drawn "
-        "plant; to search longer, raise 'candidates', 'starts' and 'steps'"
+        f"plant; {_LONGER}"
     ]

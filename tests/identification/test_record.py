@@ -543,7 +543,7 @@ def test_uneven_time_is_refused_with_a_remedy(write):
     refused(
         write(text_of(rows)),
         "time is not uniform: step 0.003 s at sample 1, 0.001 s elsewhere; "
-        "resample=HZ puts it on a uniform grid",
+        "--resample HZ interpolates it",
     )
 
 

@@ -16,7 +16,7 @@ from piezojax.solve.optimisers import METHODS
 from piezojax.study import Study, build
 from piezojax.tuning import tuner
 from piezojax.tuning.baselines import Budget
-from piezojax.tuning.make_result import worse_than_the_start
+from piezojax.tuning.make_result import not_better_than_the_start
 from piezojax.tuning.result import Result, load_result
 
 # A PID on a lag compiles in a few seconds, and the tests do not depend on the loop.
@@ -99,15 +99,17 @@ def run(loop, name="SIN50", seed=9):
 def test_gains_with_a_larger_error_than_the_start_have_a_note(plain):
     before, after = plain.result.before, plain.result.after
     assert not any("than the start" in note for note in plain.result.warnings)
-    assert worse_than_the_start(before, after) == []
-    (note,) = worse_than_the_start(after, before)
+    assert not_better_than_the_start(before, after) == []
+    (note,) = not_better_than_the_start(before, before)
+    assert note.startswith("the search found no gains that are better than the start: ")
+    (note,) = not_better_than_the_start(after, before)
     was, found = 1e3 * after.geomean_rms_um, 1e3 * before.geomean_rms_um
     assert f"{found:.4g} nm against {was:.4g} nm" in note
     limited = dict.fromkeys(before.saturated_percent, 100.0)
     railed = before.model_copy(update={"saturated_percent": limited})
-    assert worse_than_the_start(after, railed) == []
+    assert not_better_than_the_start(after, railed) == []
     lost = before.model_copy(update={"geomean_rms_um": None})
-    assert worse_than_the_start(after, lost) == []  # the alarm is more specific
+    assert not_better_than_the_start(after, lost) == []  # the alarm is more specific
 
 
 # A successful run

@@ -209,7 +209,7 @@ def _time_step(time: np.ndarray, even: bool, least: int) -> float:
         sample = int(uneven[0]) + 1
         raise ContentError(
             f"time is not uniform: step {steps[sample - 1]:g} s at sample {sample}, "
-            f"{dt:g} s elsewhere; resample=HZ puts it on a uniform grid"
+            f"{dt:g} s elsewhere; --resample HZ interpolates it"
         )
     return float((time[-1] - time[0]) / (time.size - 1))
 
