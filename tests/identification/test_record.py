@@ -243,12 +243,12 @@ def test_ragged_rows(write, width, found):
     )
 
 
-def test_a_title_above_the_header(write):
-    refused(
-        write("my record\n" + text_of(ROWS)),
-        "sample 0 has 3 columns; the first line has 1 "
-        "(lines that are not data begin with # or %)",
-    )
+@pytest.mark.parametrize("lines", [1, 2, 3])
+def test_titles_above_the_header(write, lines):
+    plain = read_record(write(text_of(ROWS)), **COLUMNS)
+    titled = read_record(write("my record: 7\n" * lines + text_of(ROWS)), **COLUMNS)
+    np.testing.assert_array_equal(titled.input, plain.input)
+    assert (titled.dt, titled.input_names) == (plain.dt, plain.input_names)
 
 
 @pytest.mark.parametrize("samples", [0, 1, 2, SHORTEST - 1])

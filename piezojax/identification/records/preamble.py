@@ -54,7 +54,8 @@ def split(
     full = [len([cell for cell in row if cell]) >= columns for row in above]
     if count == 1 or (count == 2 and not full[1]):
         return _head(list(above[0]), None, (), columns), [*above[1:], *rows]
-    if count == 2 or (full[-1] and full[-2] and all(map(_UNITS.match, above[-1]))):
+    units = all(map(_UNITS.match, above[-1]))
+    if (count == 2 and (full[0] or units)) or (full[-1] and full[-2] and units):
         return _head(list(above[-2]), list(above[-1]), above[:-2], columns), rows
     if full[-1]:
         return _head(list(above[-1]), None, above[:-1], columns), rows
