@@ -18,7 +18,8 @@ from .records.response import FrequencyResponse
 
 SMALL_MOTIONS = (
     "a frequency response shows small motions: hysteresis and creep are not in the "
-    "model; identify them from a slow record of the whole range"
+    "model, and with hysteresis the gain for large motions is larger, which takes as "
+    "much from the gain margin; identify them from a slow record of the whole range"
 )
 LONGEST = 32
 """Longest delay, in samples, that is interpolated; the rest of a longer one is a whole

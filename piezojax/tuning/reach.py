@@ -43,10 +43,13 @@ def require_reach(case: Case, data: Data) -> None:
             f"change references.offset, now {offsets[axis]:g}"
         )
         if case.plant_about.record is not None:
+            remedy += ". The stroke is that of the model: if the stage has another, "
             remedy += (
-                ". The stroke is that of the model: if the stage has another, the "
-                f"columns of {case.plant_about.record} are in another unit, or the "
+                f"the columns of {case.plant_about.record} are in another unit, or the "
                 "record is of another stage"
+                if case.response is None
+                else "the response was measured with small motions, whose gain is less "
+                "than that of large ones: fit a slow record with these dynamics held"
             )
         raise ValueError(
             f"references.{part}: {signal} spans "

@@ -2,10 +2,12 @@
 
 import copy
 import dataclasses
+from unittest.mock import Mock
 
 import pytest
 
 import piezojax as pj
+from piezojax.identification.response_model import ResponseModel
 from piezojax.study import Study, build, read, shipped
 from piezojax.tuning.data import make_data
 from piezojax.tuning.reach import SLACK, require_reach
@@ -67,6 +69,10 @@ def test_the_stroke_of_a_fitted_model_points_to_its_record():
     message = "now 0. The stroke is that of the model: .* columns of bench.csv are in"
     with pytest.raises(ValueError, match=message):
         require_reach(fitted, make_data(fitted))
+    measured = dataclasses.replace(fitted, response=Mock(spec=ResponseModel))
+    message = "the response was measured with small motions, whose gain is less than"
+    with pytest.raises(ValueError, match=message):
+        require_reach(measured, make_data(measured))
 
 
 @pytest.mark.parametrize(
