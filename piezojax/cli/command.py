@@ -123,7 +123,7 @@ def run(quiet: bool, body: Callable[[Console], Any]) -> None:
         where = f"{error.filename}: " if error.filename else ""
         raise _one_line(f"{where}{error.strerror or error}") from None
     except KeyboardInterrupt:
-        click.echo("interrupted; finished files are kept", err=True)
+        click.echo("interrupted; any finished files are kept", err=True)
         exit_interrupted()
 
 

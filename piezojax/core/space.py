@@ -116,7 +116,7 @@ class Space(eqx.Module):
         A parameter on a bound is moved inside by ``INSIDE``. Raises ValueError for a
         parameter outside its bounds.
         """
-        values = jnp.stack([as_array(get(system, path)) for path in self.paths])
+        values = as_array([get(system, path) for path in self.paths])
         for path, value, low, high in zip(
             self.paths, values, self.lower, self.upper, strict=True
         ):
@@ -133,7 +133,7 @@ class Space(eqx.Module):
             SCALES[name][direction](value)
             for name, value in zip(self.scales, values, strict=True)
         ]
-        return jnp.stack(mapped)
+        return as_array(mapped)
 
     @jax.jit
     def to_unit(self, values: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -22,6 +22,9 @@ from .structure_table import StructuresTable
 from .sweep_table import SweepTable, require_quoted_paths
 from .tables import Positive, Table, example, in_unit, unknown_key
 
+NOTHING_TO_TUNE = "tune and parameters are missing; name at least one parameter to tune"
+"""Message on a study without tuned parameters. One that is only swept needs none."""
+
 _OWN_LISTS = ("tune", "unseen", "files")
 """Keys whose lists are not values by axis."""
 
@@ -68,7 +71,7 @@ class Study(Table):
     ``controller.feedback.*``."""
     parameters: dict[str, TunedTable] = Field(default_factory=dict)
     """Parameters to tune, by path, and their ranges. At least one parameter must be
-    named here or in ``tune``."""
+    named here or in ``tune``, or in ``sweep`` for a study that is only swept."""
     objective: ObjectiveTable = ObjectiveTable()
     """Objective of the tuning."""
     optimiser: OptimiserTable = OptimiserTable()
@@ -97,10 +100,9 @@ class Study(Table):
 
     @model_validator(mode="after")
     def _tuned(self) -> "Study":
-        if not (self.tune or self.parameters):
-            raise ValueError(
-                "tune and parameters are missing; name at least one parameter to tune"
-            )
+        swept = self.sweep is not None and self.sweep.parameters
+        if not (self.tune or self.parameters or swept):
+            raise ValueError(NOTHING_TO_TUNE)
         return self
 
     @model_validator(mode="after")

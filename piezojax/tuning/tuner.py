@@ -11,6 +11,7 @@ from ..core.arrays import as_array
 from ..core.progress import Progress, Silent
 from ..solve.clock import Clock
 from ..study import Case, read, shipped
+from ..study.schema import NOTHING_TO_TUNE
 from .alarms import alarms_of, peak_notes
 from .baselines import Budget, compare_baselines
 from .beside import FiguresBeside
@@ -79,6 +80,8 @@ def _tuned(
 ) -> Outcome:
     clock = Clock()
     table, space = case.study, case.space
+    if not space.paths:
+        raise ValueError(NOTHING_TO_TUNE)
     data = make_data(case)
     require_reach(case, data)
 
@@ -98,7 +101,10 @@ def _tuned(
         front, kept = None, constraint_outcomes(objective, evaluator, after)
         if table.pareto is not None and strategy and search.status != "interrupted":
             front = trace_front(objective, case, search, strategy, evaluator, progress)
-        progress.stage("evaluating on held-out noise")
+        text = "evaluating on held-out noise"
+        if search.status == "interrupted":
+            text += " the best gains so far (Ctrl-C again ends this)"
+        progress.stage(text)
         data = judging(data, case, after)
         own = own.on(data.holdout)
         loops = {"before": own, "tuned": own.with_loop(after)}

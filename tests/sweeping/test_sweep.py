@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 from click.testing import CliRunner
 from page_reader import checked
-from swept_studies import GRID
+from swept_studies import GRID, study_of
 
 import piezojax as pj
 from piezojax.analysis.stability import OperatingPoint
@@ -18,6 +18,7 @@ from piezojax.cli.sweep import main
 from piezojax.core.feedback import loop_inputs
 from piezojax.core.paths import replace
 from piezojax.report.sweep_maps import panels
+from piezojax.study import Study, build
 from piezojax.sweeping import run_sweep
 from piezojax.sweeping.local import local_chunks
 from piezojax.sweeping.simulator import Simulator
@@ -243,6 +244,19 @@ def test_damaged_and_missing_chunks_are_simulated_again(case_of, tmp_path):
     again = run_sweep(case, tmp_path / "a", shard=(1, 3))
     assert (again.simulated, again.finished) == (1, True)
     assert_same_bits(whole, opened(tmp_path / "a"))
+
+
+def test_a_study_that_is_only_swept_has_nothing_to_tune():
+    study = {name: x for name, x in study_of(GRID).items() if name != "parameters"}
+    case = build(Study.model_validate(study), "study.toml")
+    found = pj.sweep(case)
+    assert found is not None
+    assert found.sizes["controller.proportional"] == 5
+    with pytest.raises(ValueError, match="tune and parameters are missing; name at"):
+        pj.tune(case)
+    drawn = study | {"sweep": {"method": "sobol", "samples": 8}}
+    with pytest.raises(ValueError, match="tune and parameters are missing; name at"):
+        Study.model_validate(drawn)
 
 
 def test_a_partially_written_chunk_is_ignored(case_of, tmp_path):
