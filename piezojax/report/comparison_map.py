@@ -12,7 +12,15 @@ from rich.text import Text
 
 from ..core.files import write_report
 from ..tuning.comparison import COMPARISON_FILE, ComparisonResult, TunedStudy
-from .figures import AFTER, BEFORE, MEASURED, figure, plot_style, write
+from .figures import (
+    AFTER,
+    BEFORE,
+    MEASURED,
+    figure,
+    plain_tick_labels,
+    plot_style,
+    write,
+)
 from .page import Page
 
 MARKERS = "osD^vPX*<>hp"
@@ -144,10 +152,13 @@ def write_comparison(comparison: ComparisonResult, folder: Path) -> None:
 
 
 def comparison_figure(comparison: ComparisonResult) -> Figure:
-    """Draw error against sampling rate.
+    """Draw the errors of the controllers before and after tuning.
 
-    A panel for each controller, before and after tuning; one panel for all, tuned.
+    Studies of several rates have a panel for each controller over the rate, and one for
+    all, tuned. Those of one rate have a line each.
     """
+    if len({row.rate_Hz for row in comparison.rows}) == 1:
+        return _at_one_rate(comparison)
     controllers = list(comparison.better)
     columns = min(_COLUMNS, len(controllers) + 1)
     lines = math.ceil((len(controllers) + 1) / columns)
@@ -191,6 +202,43 @@ def comparison_figure(comparison: ComparisonResult) -> Figure:
         ncols=columns,
         fontsize=7.5,
     )
+    return picture
+
+
+def _at_one_rate(comparison: ComparisonResult) -> Figure:
+    rows = comparison.rows
+    picture = figure(5.5, 0.9 + 0.36 * len(rows))
+    ax = picture.subplots()
+    places = range(len(rows))
+    for place, row in zip(places, rows, strict=True):
+        if row.before_um and row.after_um:
+            ends = [1e3 * row.before_um, 1e3 * row.after_um]
+            ax.plot(ends, [place] * 2, color=MEASURED, lw=0.8, zorder=1)
+    for field, marker, colour, face, label in (
+        ("before_um", "o", BEFORE, BEFORE, "before"),
+        ("after_um", "s", AFTER, AFTER, "tuned"),
+        ("unseen_um", "s", AFTER, "white", "tuned, other references"),
+    ):
+        errors = [getattr(row, field) for row in rows]
+        known = [(1e3 * e, place) for e, place in zip(errors, places, strict=True) if e]
+        if known:
+            ax.plot(
+                *zip(*known, strict=True),
+                color=colour,
+                mfc=face,
+                marker=marker,
+                ms=4.5,
+                ls="",
+                label=label,
+            )
+    ax.set_yticks([*places], [row.study + ("!" if row.alarms else "") for row in rows])
+    ax.set(
+        xscale="log",
+        xlabel="rms error on held-out noise (nm)",
+        ylim=(len(rows) - 0.5, -0.5),
+    )
+    plain_tick_labels(ax.xaxis)
+    picture.legend(loc="outside lower center", ncols=3, fontsize=7.5)
     return picture
 
 

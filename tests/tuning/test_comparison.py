@@ -14,6 +14,7 @@ from piezojax.cli.tune import main
 from piezojax.core.paths import get
 from piezojax.hysteresis import InverseColemanHodgdon, InversePreisach, Preisach
 from piezojax.report.comparison_map import (
+    comparison_figure,
     comparison_table,
     perturbed_table,
     perturbed_text,
@@ -226,6 +227,22 @@ def test_the_command_ends_with_the_table(compared):
     assert "geometric mean" in printed
     assert "complete: 2 of 2 studies" in printed
     assert (out / "comparison.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_studies_of_one_rate_have_a_line_each_in_the_picture(compared):
+    _, _, data = compared
+    comparison = ComparisonResult.model_validate(data)
+    first = comparison.rows[0].model_copy(update={"rate_Hz": 5e3, "alarms": []})
+    rows = [
+        first.model_copy(update={"study": "a", "before_um": 4.0, "after_um": 0.2}),
+        first.model_copy(update={"study": "b", "before_um": None, "alarms": ["rings"]}),
+    ]
+    (ax,) = comparison_figure(comparison.model_copy(update={"rows": rows})).axes
+    assert [label.get_text() for label in ax.get_yticklabels()] == ["a", "b!"]
+    before, tuned, _ = ax.get_lines()[-3:]
+    assert [list(each) for each in before.get_data()] == [[4e3], [0]]
+    assert tuned.get_xdata()[0] == pytest.approx(200.0)
+    assert ax.get_xlabel() == "rms error on held-out noise (nm)"
 
 
 def test_several_studies_are_compared(compared, tmp_path, monkeypatch):
