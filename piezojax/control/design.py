@@ -87,8 +87,10 @@ def _sliding_mode(model: ARMA, dt: float, pace: float) -> SlidingMode:
     surface, weight = 0.5 / dt, 100.0
     scale = pace / model.dc_gain()
     integral = CROSSOVER * weight / (dt * surface)
+    gains = 1e-3 * scale, integral * scale, 1e-3 * dt * scale
     return SlidingMode(
-        SwitchingPID(1e-3 * scale, integral * scale, 1e-3 * dt * scale, dt=dt),
+        # 0.1 1/s hardly acts, but a search on a logarithmic scale can begin there.
+        SwitchingPID(*gains, dt=dt, anti_windup=0.1),
         surface=surface,
         error_weight=1.0,
         control_weight=weight,
