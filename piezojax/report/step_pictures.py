@@ -32,7 +32,7 @@ _COLUMNS = {
 """Columns of the table: title with unit, and the factor from s or a share to the
 unit."""
 
-_ROOM = 4.0  # length of the picture, in settling times
+_ROOM = 2.0  # length of the picture, in settling times
 _HEIGHTS = 3.0  # most overshoot that is drawn, in heights of the step
 _MARGIN = 0.1  # room above and below, in heights of the step
 

@@ -179,11 +179,12 @@ def tracking_figure(outcome: Outcome, logs: dict[Trace, Logs]) -> Figure:
         )
         left.set(ylabel=f"{trace.name}\n{_quantity(trace)} ({unit})")
         right.set(ylabel=f"tracking error ({small})")
+        left.locator_params(axis="x", nbins=5)
         legend_above(left)
         legend_above(right)
     for ax in axes[-1]:
         ax.set_xlabel("time (s)")
-    add_title(picture, f"{outcome.result.heading}: hold-out runs")
+    add_title(picture, f"{outcome.result.heading}: hold-out, first draw of the noise")
     return picture
 
 
