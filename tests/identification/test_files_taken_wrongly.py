@@ -11,6 +11,7 @@ from piezojax.identification.chain import structure
 from piezojax.identification.estimators.model_preisach import PreisachFit
 from piezojax.identification.plausibility import assumed_units
 from piezojax.identification.records.parts import train_and_validation
+from piezojax.identification.records.recognise import recognised
 
 TIME = 1e-3 * np.arange(300.0)
 DRIVE = 50.0 - 50.0 * np.cos(2.0 * np.pi * 5.0 * TIME)
@@ -109,3 +110,15 @@ def test_preisach_describes_an_output_that_falls(monkeypatch, sign):
     run = found.simulations[0][:, 0]
     np.testing.assert_allclose(run[1:], sign * 0.1 * DRIVE[:-1], atol=1e-12)
     assert len(found.system.parts) == (2 if sign > 0.0 else 3)
+
+
+def test_a_frequency_response_is_pointed_to_its_option(tmp_path):
+    path = tmp_path / "bode.csv"
+    columns = np.c_[np.geomspace(5.0, 500.0, 40), np.zeros(40), np.ones(40)]
+    header = "Frequency (Hz),Magnitude (dB),Phase (deg)"
+    np.savetxt(path, columns, delimiter=",", header=header, comments="")
+    message = "; a frequency response is fitted by identify --response"
+    with pytest.raises(ValueError, match=message):
+        recognised(path, dict.fromkeys(("time", "input", "output", "rate")))
+    with pytest.raises(ValueError, match=message):
+        read_record(path, time=None, input=1, output=2)

@@ -10,7 +10,7 @@ from ...core.conversion import factor
 from .columns import Column, Columns
 from .formats import read_columns
 from .record import Record
-from .sampled import is_clock
+from .sampled import is_clock, response_hint
 from .units import SECONDS, seconds_of, unit_of
 
 _QUANTITIES = {"input": "V", "output": "um"}
@@ -67,6 +67,7 @@ def recognised(path: Path, given: dict[str, Any]) -> dict[str, Any]:
             raise ValueError(
                 f"{path.name}: {len(of_kind)} columns are in {unit} or a multiple of "
                 f"it; name the {role} with --{role}: there are {_listed(columns)}"
+                f"{response_hint(columns)}"
             )
         found[role] = of_kind[0]
     return found

@@ -96,7 +96,7 @@ def read_sampled(
             steps = {f"column {name!r}": _time_step(instants, even, least)} | steps
         dt = _common_step(steps)
     except ContentError as error:
-        raise ValueError(f"{path.name}: {error}") from None
+        raise ValueError(f"{path.name}: {error}{response_hint(columns)}") from None
     if instants is None:
         instants = dt * np.arange(values[signals[0]].size)
     units = {name: unit_of(name, columns[name]) for name in signals}
@@ -119,6 +119,13 @@ def read_plain_columns(
     except ContentError as error:
         raise ValueError(f"{path.name}: {error}") from None
     return names, values, {name: unit_of(name, columns[name]) for name in values}
+
+
+def response_hint(columns: Columns) -> str:
+    """Return the end of a message on a file that may hold a frequency response."""
+    if any(unit_of(name, column) == "Hz" for name, column in columns.items()):
+        return "; a frequency response is fitted by identify --response"
+    return ""
 
 
 def is_clock(name: str, column: Column) -> bool:
