@@ -102,6 +102,22 @@ def test_a_fitted_plant_is_checked_on_other_records(folder):
     assert case_of(folder, plant_of(first)).plant_about.checked == []
 
 
+def test_a_check_may_have_other_columns(folder):
+    first = record_in("V", "um", folder)
+    rows = np.loadtxt(folder / first, delimiter=",", skiprows=1)
+    rows[:, 0] *= 1e3
+    header = "Time (ms),Command (V),z (um)"
+    np.savetxt(folder / "own.csv", rows, delimiter=",", header=header, comments="")
+    named = {"time": "time_s", "input": "drive_V", "output": "position_um"}
+    case = case_of(folder, plant_of(first) | named | {"check": "own.csv"})
+    assert case.plant_about.checked == ["own.csv"]
+    assert case.plant_about.unsafe == []
+    assert (
+        "plant.check: own.csv has other columns; taken: time 'Time (ms)', input "
+        "'Command (V)', output 'z (um)'"
+    ) in case.notes
+
+
 def test_a_record_of_another_stage_is_an_alarm_of_the_model(folder):
     first, name = record_in("V", "um", folder), "other.csv"
     rows = np.loadtxt(folder / first, delimiter=",", skiprows=1)

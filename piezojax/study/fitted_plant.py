@@ -20,6 +20,8 @@ from ..identification import (
     read_record,
     validate,
 )
+from ..identification.records.formats import read_columns
+from ..identification.records.recognise import recognised
 from ..identification.records.response_file import read_response
 from ..identification.response_model import ResponseModel, identify_response
 from .origin import check_rate, in_study_units, response_in_study_units
@@ -38,13 +40,20 @@ def fitted_plant(
     """
     description = validated(RecordPlant, table, "plant")
 
-    def read_as(path: Path, where: str) -> Record:
-        record = read_record(folder / path, **description.columns)
+    def read_as(path: Path, where: str, columns: dict[str, Any]) -> Record:
+        record = read_record(folder / path, **columns)
         check_rate(1.0 / record.dt, study, where)
         return in_study_units(record, study, where)
 
-    records = [read_as(path, "plant.record") for path in description.record]
-    others = [read_as(path, "plant.check") for path in description.check]
+    columns, notes = description.columns, []
+    records = [read_as(path, "plant.record", columns) for path in description.record]
+    others = []
+    for path in description.check:
+        own = _own_columns(folder / path, columns)
+        others.append(read_as(path, "plant.check", own or columns))
+        if own:
+            taken = ", ".join(f"{role} {own[role]!r}" for role in _ROLES)
+            notes.append(f"plant.check: {path.name} has other columns; taken: {taken}")
     train, validate_on, test = (
         None if span is None else slice(*span)
         for span in (description.train, description.validate_on, description.test)
@@ -73,7 +82,21 @@ def fitted_plant(
     if not others:
         return fit, fit.about, ()
     found = validate(fit.system, fit.about, others)
-    return fit, found.about, found.report.notes
+    return fit, found.about, [*notes, *found.report.notes]
+
+
+_ROLES = "time", "input", "output"
+
+
+def _own_columns(path: Path, columns: dict[str, Any]) -> dict[str, Any] | None:
+    """Return the columns that are recognised in the file at ``path``.
+
+    None if the file has all that are named in ``columns``.
+    """
+    named = [columns[role] for role in _ROLES if isinstance(columns[role], str)]
+    if not named or set(named) <= set(read_columns(path)):
+        return None
+    return recognised(path, columns | dict.fromkeys(_ROLES))
 
 
 def on_axes(system: System, study: Study) -> System:

@@ -92,8 +92,8 @@ class RecordPlant(Table):
     steps: Count = Options.steps
     """Largest number of optimiser steps."""
     check: tuple[Path, ...] = ()
-    """Another record of the stage with the same columns, or several, on which the
-    fitted plant is validated."""
+    """Another record of the stage, or several, on which the fitted plant is validated.
+    If a column is missing there, all are recognised by their names and units."""
 
     @field_validator("record", "check", mode="before")
     @classmethod
