@@ -118,8 +118,9 @@ class KnownPlant:
         """Return the origin ``about`` of a new fit, with all that the inputs cover."""
         pairs = zip(about.input_ranges, self.about.input_ranges, strict=True)
         ranges = [(min(a[0], b[0]), max(a[1], b[1])) for a, b in pairs]
-        known = self.about.input_slews or [0.0] * len(ranges)
-        slews = [max(pair) for pair in zip(about.input_slews, known, strict=True)]
+        # The known slews are empty in a file of an earlier version.
+        pairs = zip(about.input_slews, self.about.input_slews, strict=False)
+        slews = [max(pair) for pair in pairs]
         return about.model_copy(update={"input_ranges": ranges, "input_slews": slews})
 
     def _deviations(self, system: System, dt: float) -> dict[str, float]:

@@ -1,5 +1,7 @@
 """A known plant fitted again: its prior, its delay, and what short records change."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -214,6 +216,14 @@ def test_the_search_also_starts_at_the_resonance_of_the_record_and_later():
 def test_the_range_of_the_known_record_remains():
     fit = fitted(plant())
     assert fit.about.input_ranges == [(0.0, 100.0)]
+    assert fit.about.input_slews == []  # those of the known record are not known
+    fast, slow = (
+        fit.known.about.model_copy(update={"input_slews": [slew]})
+        for slew in (20.0, 10.0)
+    )
+    for first, second in ((fast, slow), (slow, fast)):
+        plant_known = dataclasses.replace(fit.known, about=first)
+        assert plant_known.widened(second).input_slews == [20.0]
 
 
 def test_a_plant_without_fitted_parameters_is_refused():
