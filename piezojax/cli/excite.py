@@ -154,8 +154,9 @@ def _write_designed(results, limits, duration, points, out, seed, console):
             "lower": bounds.lower,
             "upper": bounds.upper,
             "rate": case.study.rate,
-            "slew": limits.get("slew") or known_slew(case),
         }
+        if "slew" not in limits:
+            of_study["slew"] = known_slew(case)
         generator = Generator(**(of_study | limits))
         samples = points or round((duration or SECONDS) * generator.rate)
         found = next_record(

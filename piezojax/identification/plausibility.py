@@ -42,12 +42,14 @@ def assumed_units(record: Record) -> list[str]:
     """Return a note for each column whose unit is not stated anywhere."""
     units = dict(zip(record.input_names, record.input_units, strict=False))
     units |= dict(zip(record.output_names, record.output_units, strict=False))
+    bare = list(record.assumed)
     if record.clock:
         units[record.clock] = "s"
+        bare.append(record.clock)
     return [
         f"the unit of column {name!r} is not stated; {units[name]} is assumed: name "
         f"the column with its unit, as {name}_{units[name]}"
-        for name in (*record.assumed, *filter(None, [record.clock]))
+        for name in bare
     ]
 
 

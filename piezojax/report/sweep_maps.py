@@ -10,8 +10,8 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from rich.table import Table
 
+from ..study.sweep_table import SENSITIVITY
 from ..sweeping.metric_maps import (
-    PEAK,
     MetricMap,
     averaging,
     metric_maps,
@@ -206,10 +206,10 @@ def best_table(path: Path) -> Table:
             table.add_column(axis.label, justify="right")
         table.add_column("least", justify="right")
         table.add_column("unstable or lost", justify="right")
-        if PEAK not in dataset and "axis" not in dataset.dims:
+        if SENSITIVITY not in dataset and "axis" not in dataset.dims:
             table.caption = (
                 "Only runs were judged: a point may be unstable for small motions. "
-                f"{PEAK} among sweep.metrics leaves such points out."
+                f"{SENSITIVITY} among sweep.metrics leaves such points out."
             )
         for panel in panels(dataset, name):
             values = panel.finite()

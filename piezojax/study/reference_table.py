@@ -5,7 +5,16 @@ from typing import Annotated
 from pydantic import Field, field_validator, model_validator
 
 from .file_tables import TrajectoryTable, check_trajectory_name
-from .tables import ByAxis, Finite, NotNegative, Positive, Table, example, in_unit
+from .tables import (
+    ByAxis,
+    Finite,
+    NotNegative,
+    Positive,
+    Table,
+    example,
+    in_unit,
+    once,
+)
 
 
 class References(Table):
@@ -38,13 +47,7 @@ class References(Table):
     """Trajectories in files, by name; they have an offset of their own and no
     amplitude."""
 
-    @field_validator("tune", "unseen")
-    @classmethod
-    def _signals(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"{name} is listed twice")
-        return names
+    _once = field_validator("tune", "unseen")(once)
 
     @model_validator(mode="after")
     def _consistent(self) -> "References":

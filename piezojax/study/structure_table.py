@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import Field, field_validator
 
-from .tables import Table, example
+from .tables import Table, example, once
 
 MOST_NOTCHES = 4
 """Largest number of notches of a structure."""
@@ -29,7 +29,4 @@ class StructuresTable(Table):
     @field_validator("notches")
     @classmethod
     def _distinct(cls, counts: tuple[int, ...]) -> tuple[int, ...]:
-        for count in counts:
-            if counts.count(count) > 1:
-                raise ValueError(f"{count} is listed twice")
-        return tuple(sorted(counts))
+        return tuple(sorted(once(counts)))

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from ..core.metrics import TrackingFigures
-from .tables import Finite, RangeTable, Table, example, one_of
+from .tables import Finite, RangeTable, Table, example, once, one_of
 
 SENSITIVITY = "sensitivity_peak"
 METRICS = (*TrackingFigures._fields, SENSITIVITY)
@@ -85,13 +85,7 @@ class SweepTable(Table):
     def _known(cls, names: tuple[str, ...]) -> tuple[str, ...]:
         return tuple(one_of(name, METRICS) for name in names)
 
-    @field_validator("metrics", "plants", "references")
-    @classmethod
-    def _once(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"{name} is listed twice")
-        return names
+    _once = field_validator("metrics", "plants", "references")(once)
 
     @field_validator("parameters", mode="before")
     @classmethod

@@ -28,6 +28,14 @@ class Table(BaseModel):
     )
 
 
+def once(values: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Return ``values``; raise ValueError if one of them is listed twice."""
+    for value in values:
+        if values.count(value) > 1:
+            raise ValueError(f"{value} is listed twice")
+    return values
+
+
 def in_unit(name: str) -> Any:
     """Return an annotation of a field with its unit, for the schema of a study."""
     return Field(json_schema_extra={"unit": name})

@@ -5,15 +5,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ..study.sweep_table import METRICS
+from ..study.sweep_table import METRICS, SENSITIVITY
 
 if TYPE_CHECKING:
     from xarray import Dataset
 
 _BEYOND = 1e3  # factor on the median; points with larger values count as lost
-
-PEAK = "sensitivity_peak"
-"""Metric that is infinite for an unstable loop: one whose runs may still look good."""
 
 
 class MetricMap(NamedTuple):
@@ -84,10 +81,13 @@ def metric_maps(dataset: "Dataset", name: str) -> list[MetricMap]:
 
 
 def _unstable(dataset: "Dataset", chosen: dict[str, int]) -> np.ndarray:
-    """Return the points with an infinite sensitivity peak; none without that metric."""
-    if PEAK not in dataset:
+    """Return the points with an infinite sensitivity peak; none without that metric.
+
+    The peak is infinite for an unstable loop, whose runs may still look good.
+    """
+    if SENSITIVITY not in dataset:
         return np.array(False)
-    peak = dataset[PEAK]
+    peak = dataset[SENSITIVITY]
     peak = peak.isel({d: i for d, i in chosen.items() if d in peak.dims})
     return ~np.isfinite(peak.values)
 

@@ -27,8 +27,8 @@ class Drive(BaseModel):
       changes.
 
     All but the first are the largest over the held-out references, each with its first
-    noise draw, from ``references.settle`` on; that of the current includes the time
-    before. Figures
+    noise draw, from ``references.settle`` on; the peak of the current is that of the
+    whole run. Figures
     that need the capacitance are None without it, and all figures of a run that
     diverged are None.
     """
