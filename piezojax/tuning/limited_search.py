@@ -37,8 +37,9 @@ def search_within_limits(
 
     The default limits are rarely active, and a loss with margins takes longer to
     compile. Unless the study limits a margin itself, the box is searched without the
-    default limits first, and again with them if the result violates one. If margins are
-    limited on many plants, a search uses only the worst of them.
+    default limits first, and again with them if the result violates one: also from that
+    result, which is often nearer to the best gains than any point that keeps the
+    limits. If margins are limited on many plants, a search uses only the worst of them.
     """
     study = case.study
     own = {
@@ -66,7 +67,7 @@ def search_within_limits(
         search.status = "interrupted"
         return objective, search, strategy, INTERRUPTED
     every = every.on_margin_stages(carried.stages)
-    again, strategy = search_box(every, case, progress, search.unit[None])
+    again, strategy = search_box(every, case, progress, known=search.unit)
     again.evaluations += search.evaluations
     return _repeated(every, case, evaluator, carried, again, strategy, progress)
 

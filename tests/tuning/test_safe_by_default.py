@@ -1,10 +1,13 @@
 """Default limits: kept if active, without effect if not, off on request."""
 
+import numpy as np
 import pytest
 import tomli_w
 
 import piezojax as pj
 from piezojax.analysis.stability import OperatingPoint, stability_report
+from piezojax.tuning import limited_search
+from piezojax.tuning.search import search_box
 
 STUDY = {
     "title": "integral action on a stage with a light mode",
@@ -56,3 +59,22 @@ def test_the_defaults_hold_where_unlimited_gains_violate_them(free, safe):
     assert safe.result.constraints["sensitivity_peak"].kept
     assert safe.result.constraints["delay_margin"].limit == 1.0
     assert safe.result.after.worst_rms_um > free.result.after.worst_rms_um
+
+
+def test_the_search_within_the_limits_also_begins_at_the_gains_without(
+    tmp_path, monkeypatch
+):
+    searches = []
+
+    def spied(*args, **options):
+        found = search_box(*args, **options)
+        searches.append(found[0])
+        return found
+
+    monkeypatch.setattr(limited_search, "search_box", spied)
+    outcome = tuned(tmp_path)
+    free, safe = searches
+    assert len(free.starts) == 1
+    assert safe.starts.shape == (2, 1)
+    np.testing.assert_array_equal(safe.starts[1], free.unit)
+    assert outcome.result.constraints["sensitivity_peak"].kept
