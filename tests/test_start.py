@@ -16,13 +16,24 @@ from piezojax.cli import start
 from piezojax.control import PID
 from piezojax.identification import Record, read_record
 from piezojax.identification.records.recognise import noise_rms, recognised
+from piezojax.identification.records.response import FrequencyResponse
+from piezojax.identification.records.saved_response import save_response
 from piezojax.signals import signal, time_grid
 from piezojax.study import build, contents_of, load, sha256_of
-from piezojax.study.first_plan import Plan, doubts, planned
-from piezojax.study.first_study import first_study
+from piezojax.study.first_plan import Plan, Shown, doubts
+from piezojax.study.first_plan import planned as planned_by
+from piezojax.study.first_study import (
+    first_study,
+    plant_of_record,
+    plant_of_response,
+)
 from piezojax.tuning.result import Result, Scores
 
 NONE = {"time": None, "input": None, "output": None, "rate": None}
+
+
+def planned(record, given):
+    return planned_by(Shown.by_record(record), given)
 
 
 def lag_record(samples=3000, noise=0.01):
@@ -195,6 +206,7 @@ def test_answers_replace_defaults(record):
         ({"track": " ,"}, "track names no reference, as SIN10,PWSW40"),
         ({"track": "SIN"}, "track: SIN has no frequency; SIN10 has 10 Hz"),
         ({"track": "SINE10"}, "signal 'SINE10' is unknown; it must be one of SIN"),
+        ({"slew_rate": -1.0}, "slew_rate is -1 V/s; it must be at least 0"),
         ({"scale": -1.0}, "scale is -1 V/um; it must be at least 0"),
         (
             {"lowest": 3.0, "highest": 2.0},
@@ -204,7 +216,7 @@ def test_answers_replace_defaults(record):
         (
             {"amplitude": 4.0, "offset": 1.0},
             r"the references cover 1 to 9 um \(offset to offset \+ 2 amplitude\), the "
-            "record .* um: change amplitude or offset, or record the whole range",
+            "measured stage .* um: change amplitude or offset, or measure the whole",
         ),
     ],
 )
@@ -228,7 +240,7 @@ def test_impossible_answers_are_refused(record, given, message):
 )
 def test_answers_that_the_record_contradicts_are_doubted(record, given, message):
     loaded = read_record(record, time="time_s", input=1, output=2)
-    found = doubts(planned(loaded, given), loaded)
+    found = doubts(planned(loaded, given), Shown.by_record(loaded))
     if message is None:
         assert found == []
     else:
@@ -241,14 +253,15 @@ def test_a_record_that_was_smoothed_is_doubted(record):
     low_pass = scipy.signal.butter(4, 0.05, output="sos")
     smoothed = scipy.signal.sosfilt(low_pass, loaded.output - loaded.output[0])
     quiet = Record(loaded.input, loaded.output[0] + smoothed, loaded.dt)
-    (doubt,) = doubts(planned(quiet, {}), quiet)
+    (doubt,) = doubts(planned(quiet, {}), Shown.by_record(quiet))
     assert "less than that of any sensor: if the displacement was smoothed" in doubt
 
 
 def test_the_study_holds_the_answers_and_fits_the_record(record, tmp_path):
     plan = Plan(0.0, 80.0, 0.02, 2.0, "SIN2, SCAN4", 1.0, 2.0, 50.0, "inversion_pid")
     columns = {"time": "time_s", "input": "command_V", "output": "sensor_um"}
-    text = first_study(plan, record, columns, 1e3, folder=tmp_path, model="lag", seed=4)
+    plant = plant_of_record(record, columns, tmp_path, model="lag")
+    text = first_study(plan, plant, 1e3, seed=4)
     path = tmp_path / "study.toml"
     path.write_text(text, encoding="utf-8")
     study = load(path)
@@ -270,6 +283,65 @@ def test_the_study_holds_the_answers_and_fits_the_record(record, tmp_path):
     assert any(text.startswith("fitting from") for text in stages)
 
 
+def test_the_voltage_stays_as_slow_as_the_record_or_the_amplifier(record):
+    loaded = read_record(record, time="time_s", input=1, output=2)
+    plan, plant = planned(loaded, {}), {"record": "record.csv"}
+    tables = tomllib.loads(first_study(plan, plant, 1e3))
+    assert tables["constraints"] == {
+        "peak_slew": pytest.approx(loaded.slews[0], rel=1e-3)
+    }
+    assert "slew_rate" not in tables["actuator"]
+    known = planned(loaded, {"slew_rate": 5e3})
+    tables = tomllib.loads(first_study(known, plant, 1e3))
+    assert tables["constraints"] == {}
+    assert tables["actuator"]["slew_rate"] == 5e3
+
+
+LIMITS = {"lower": -20.0, "upper": 120.0, "noise": 2e-3}
+
+
+def mode_response(gain=0.1):
+    """Return the response of a mode at 300 Hz from 1 Hz to 2 kHz, in um/V."""
+    frequency = np.geomspace(1.0, 2000.0, 200)
+    ratio = frequency / 300.0
+    return FrequencyResponse(frequency, gain / (1.0 - ratio**2 + 0.1j * ratio))
+
+
+@pytest.mark.parametrize("gain", [0.1, -0.1])
+def test_a_response_and_the_limits_give_the_range(gain):
+    shown = Shown.by_response(mode_response(gain), 1e-4, LIMITS)
+    low, high = sorted((-20.0 * gain, 120.0 * gain))
+    assert shown.outputs == pytest.approx((low, high), rel=1e-3)
+    plan = planned_by(shown, LIMITS)
+    assert (plan.lower, plan.upper, plan.noise) == (-20.0, 120.0, 2e-3)
+    assert plan.amplitude == pytest.approx(0.2 * 14.0, rel=1e-3)
+    assert plan.offset + plan.amplitude == pytest.approx(50.0 * gain, rel=1e-3)
+    assert (plan.frequency, plan.recorded_slew) == (10.0, 0.0)
+    assert doubts(plan, shown) == []
+    assert "is it in um" in doubts(replace(plan, noise=1.0), shown)[0]
+
+
+def test_a_response_without_limits_is_refused():
+    with pytest.raises(ValueError, match="not show these: give --lower and --noise"):
+        Shown.by_response(mode_response(), 1e-4, {"upper": 3.0})
+
+
+def test_the_study_of_a_response_fits_it(tmp_path):
+    path = tmp_path / "bench.csv"
+    save_response(mode_response(), path)
+    plan = planned_by(Shown.by_response(mode_response(), 1e-4, LIMITS), LIMITS)
+    plant = plant_of_response(path, tmp_path, unit="um/V", held=True)
+    assert plant == {"response": "bench.csv", "unit": "um/V", "held": True}
+    text = first_study(plan, plant, 1e4)
+    file = tmp_path / "study.toml"
+    file.write_text(text, encoding="utf-8")
+    case = build(load(file), file)
+    assert case.response is not None
+    assert case.study.title == "inversion_sliding_mode on the stage of bench.csv"
+    assert case.study.rate == 1e4
+    assert "controller.controller.feedback.law.integral" in case.space.paths
+
+
 DEVICE_PLAN = Plan(
     0.0, 80.0, 0.02, 2.0, "SIN2", 1.0, 2.0, 50.0, "nv200", 5.0, -1.0, 9.0
 )
@@ -282,7 +354,8 @@ def test_the_study_of_a_device_runs_at_its_rate(record, tmp_path, device, parame
     plan = replace(DEVICE_PLAN, controller=device)
     columns = {"time": "time_s", "input": "command_V", "output": "sensor_um"}
     columns["resample"] = 2e4
-    text = first_study(plan, record, columns, 2e4, folder=tmp_path, model="lag")
+    plant = plant_of_record(record, columns, tmp_path, model="lag")
+    text = first_study(plan, plant, 2e4)
     path = tmp_path / "study.toml"
     path.write_text(text, encoding="utf-8")
     case = build(load(path), path)
@@ -305,23 +378,27 @@ def test_the_study_of_a_device_runs_at_its_rate(record, tmp_path, device, parame
 def test_a_record_at_another_rate_than_the_device_is_refused(tmp_path):
     message = "the record has 16000 Hz, the device 20000 Hz: record at that rate"
     with pytest.raises(ValueError, match=message):
-        first_study(DEVICE_PLAN, tmp_path / "r.csv", {}, 16e3, folder=tmp_path)
+        first_study(DEVICE_PLAN, {"record": "r.csv"}, 16e3)
+    message = "--rate is 16000 Hz, but the device has 20000 Hz"
+    with pytest.raises(ValueError, match=message):
+        first_study(DEVICE_PLAN, {"response": "r.csv"}, 16e3)
 
 
 def test_a_device_without_a_scale_is_doubted_or_refused(record, tmp_path):
     loaded = read_record(record, time="time_s", input=1, output=2)
-    (doubt,) = doubts(planned(loaded, {"controller": "nv200"}), loaded)
+    shown = Shown.by_record(loaded)
+    (doubt,) = doubts(planned(loaded, {"controller": "nv200"}), shown)
     assert "--controller nv200, with a record of error and voltage" in doubt
-    assert doubts(planned(loaded, {"controller": "nv200", "scale": 2.0}), loaded) == []
+    assert doubts(planned(loaded, {"controller": "nv200", "scale": 2.0}), shown) == []
     plan = replace(DEVICE_PLAN, controller="e727", scale=0.0)
     with pytest.raises(ValueError, match="the E-727 needs the scale of its gains"):
-        first_study(plan, tmp_path / "r.csv", {}, 2e4, folder=tmp_path)
+        first_study(plan, {"record": "r.csv"}, 2e4)
 
 
 @pytest.mark.parametrize("title", ['"quoted" \\ back', "um ä µ"])
 def test_names_of_files_are_quoted(tmp_path, title):
     plan = Plan(0.0, 80.0, 0.02, 2.0, "SIN2", 1.0, 2.0, 50.0)
-    text = first_study(plan, tmp_path / title, {}, 1e3, folder=tmp_path)
+    text = first_study(plan, plant_of_record(tmp_path / title, {}, tmp_path), 1e3)
     assert tomllib.loads(text)["plant"]["record"] == title
 
 
@@ -379,7 +456,7 @@ class Verbs:
 def run(monkeypatch, record, tmp_path):
     """Return a start with stand-ins: exit status, output, calls of the verbs."""
 
-    def started(*options, answers=None, **result):
+    def started(*options, answers=None, record=record, **result):
         verbs = Verbs(**result)
         monkeypatch.setattr(start, "tune_study", verbs.tune)
         monkeypatch.setattr(start, "export_file", verbs.export)
@@ -404,11 +481,11 @@ def test_a_start_without_questions_tunes_and_exports(run, tmp_path):
     assert "done: gains and pictures in" in output
     study = load(tmp_path / "out" / "study.toml")
     assert study.actuator.upper == 60.0
-    assert set(study.limits) == {"sensitivity_peak", "delay_margin"}
+    assert set(study.limits) == {"sensitivity_peak", "delay_margin", "peak_slew"}
 
 
 def test_the_questions_of_a_device_are_asked_for_it_alone(run, tmp_path):
-    answers = 8 * "\n" + "nv200\n2.5\n\n12\n"
+    answers = 9 * "\n" + "nv200\n2.5\n\n12\n"
     status, output, calls = run("--resample", "20000", answers=answers)
     assert status == 0, output
     assert calls == [("tune", "tuned"), ("export", "tuned", "vendor")]
@@ -424,12 +501,13 @@ def test_other_controllers_have_no_questions_of_devices(run):
 
 
 def test_answers_are_asked_for_with_defaults(run, tmp_path):
-    answers = "\n80\n\n3\n\n0.5\n\n70\ninversion_pid\n"
+    answers = "\n80\n900\n\n3\n\n0.5\n\n70\ninversion_pid\n"
     status, output, _ = run(answers=answers)
     assert status == 0, output
     assert "references to track, with their frequencies in Hz [SIN3,PWSW12]:" in output
     study = load(tmp_path / "out" / "study.toml")
     assert study.actuator.upper == 80.0
+    assert study.actuator.slew_rate == 900.0
     assert study.references.tune == ("SIN3", "PWSW12")
     assert study.references.amplitude == 0.5
     assert study.controller == {
@@ -441,7 +519,7 @@ def test_answers_are_asked_for_with_defaults(run, tmp_path):
 
 
 def test_a_question_is_asked_again_after_a_refused_answer(run, tmp_path):
-    answers = "\n0\n80\n\n3\nSIN\n\n0.5\n\n\n\n"
+    answers = "\n0\n80\n\n\n3\nSIN\n\n0.5\n\n\n\n"
     status, output, _ = run(answers=answers)
     assert status == 0, output
     assert "upper 0 V; lower must be below upper\nupper limit of" in output
@@ -557,9 +635,68 @@ def test_alarms_of_earlier_gains_are_printed_again(run):
     assert "ALARM: it rings" in output
 
 
+@pytest.fixture
+def response(tmp_path):
+    path = tmp_path / "bench.csv"
+    save_response(mode_response(), path)
+    return path
+
+
+LIMITED = "--lower", "-20", "--upper", "120", "--noise", "0.002"
+
+
+def test_a_start_from_a_response_tunes_and_exports(run, response, tmp_path):
+    options = "--response", "--rate", "10000", "--yes", *LIMITED
+    status, output, calls = run(*options, record=response)
+    assert status == 0, output
+    assert calls == [("tune", "tuned"), ("export", "tuned", "c")]
+    assert f"read {response}: 200 lines from 1 to 2000 Hz" in output
+    plant = load(tmp_path / "out" / "study.toml").plant
+    assert plant == {"response": "../bench.csv"}
+    for again in (options, ("--response",), ()):
+        status, output, calls = run(*again, record=response)
+        assert (status, calls) == (0, [])
+        assert "tuned before: the gains are in" in output
+    status, output, _ = run("--response", "--rate", "9000", *LIMITED, record=response)
+    assert status == 1
+    assert "does not follow --rate, --lower, --upper, --noise: edit it" in output
+
+
+def test_what_a_response_does_not_show_is_asked_first(run, response, tmp_path):
+    answers = "-20\n120\n0.002\n\n5\n"
+    options = "--response", "--rate", "10000"
+    status, output, _ = run(*options, record=response, answers=answers + 9 * "\n")
+    assert status == 0, output
+    assert "lower limit of the voltage [V]: -20\nupper limit" in output
+    study = load(tmp_path / "out" / "study.toml")
+    assert (study.actuator.lower, study.sensor.noise_rms) == (-20.0, 0.002)
+    assert study.references.tune == ("SIN5", "PWSW20")
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        ((), "--response needs a --rate: that of the controller, Hz"),
+        (("--rate", "1e4", "--yes"), "give --lower and --upper and --noise"),
+        (
+            ("--rate", "1e4"),
+            "no answer for the lower limit of the voltage [V]: give it",
+        ),
+        (("--input", "0"), "--input is for a record over time, not for a --response"),
+        (("--model", "lag"), "--model is for a record over time, not for a --resp"),
+        (("--rate", "1e4", "--unit", "V"), "is in um/V, and the unit given is V"),
+    ],
+)
+def test_bad_options_of_a_response_are_refused(run, response, options, message):
+    status, output, calls = run("--response", *options, record=response)
+    assert (status, calls) == (1, [])
+    assert message in output
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--held",), "--held needs --response"),
         (("--controller", "pid"), "'pid' is unknown; there are inversion_sliding_mode"),
         (("--frequency", "-1"), "frequency is -1 Hz; it must be above 0"),
         (("--lower", "9", "--upper", "3"), "lower is 9 V and upper 3 V; lower must"),

@@ -80,31 +80,34 @@ def _with_options(function: Callable, options: Iterable[Callable]) -> Callable:
     return function
 
 
-def print_columns(console: Console, records: Iterable["Record"]) -> None:
-    """Print the columns with their units and ranges, the samples and the rate."""
+def print_columns(console: Console, records: "Iterable[Record]") -> None:
+    """Print ``columns_of`` each record."""
     for record in records:
-        sides = "; ".join(
-            f"{role} {', '.join(columns)}"
-            for role, columns in (
-                ("input", _of(record, record.input_names, record.input_units)),
-                ("output", _of(record, record.output_names, record.output_units)),
-                *(
-                    (role, [_range(signal, unit)])
-                    for role, signal, unit in (
-                        ("reference", record.reference, record.output_unit),
-                        ("dither", record.dither, record.input_unit),
-                    )
-                    if signal is not None
-                ),
-            )
+        console.print(columns_of(record), soft_wrap=True, markup=False)
+
+
+def columns_of(record: "Record") -> str:
+    """Return the columns with their units and ranges, the samples and the rate."""
+    sides = "; ".join(
+        f"{role} {', '.join(columns)}"
+        for role, columns in (
+            ("input", _of(record, record.input_names, record.input_units)),
+            ("output", _of(record, record.output_names, record.output_units)),
+            *(
+                (role, [_range(signal, unit)])
+                for role, signal, unit in (
+                    ("reference", record.reference, record.output_unit),
+                    ("dither", record.dither, record.input_unit),
+                )
+                if signal is not None
+            ),
         )
-        console.print(
-            f"read {record.source}: {sides}; {record.samples} samples at "
-            f"{1.0 / record.dt:.6g} Hz"
-            + (f" ({record.clock!r} in s, assumed)" if record.clock else ""),
-            soft_wrap=True,
-            markup=False,
-        )
+    )
+    clock = f" ({record.clock!r} in s, assumed)" if record.clock else ""
+    return (
+        f"read {record.source}: {sides}; {record.samples} samples at "
+        f"{1.0 / record.dt:.6g} Hz{clock}"
+    )
 
 
 def _of(record: "Record", names: Sequence[str], units: Sequence[str]) -> list[str]:

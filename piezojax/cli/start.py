@@ -1,6 +1,7 @@
 """``python -m piezojax.start RECORD``: from a record to exported gains."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -10,69 +11,40 @@ from rich.console import Console
 from ..core.files import numbered_folder, write_text
 from .command import RESULTS, Command, common, print_alarms, print_loading, run
 from .export import export_file
-from .records import print_columns, recognised_columns
+from .questions import QUESTIONS, asked, concerns, option, questions
+from .records import columns_of, recognised_columns
 from .tune import finish, sliders_option, tune_study
 
 if TYPE_CHECKING:
-    from ..identification import Record
-    from ..study.first_plan import Plan
+    from ..study.first_plan import Plan, Shown
     from ..tuning.outcome import Outcome
 
 STUDY, TUNED, EXPORTED = "study.toml", "tuned", "controller"
 """Names in the results folder: the study, the folders of gains and of C code."""
 
+OF_RECORDS = "time", "input", "output", "rate", "resample"
+"""Options of ``recognised_columns``."""
+
+OF_RESPONSES = "unit", "held"
+"""Options that only ``--response`` takes."""
+
 INTERRUPTED = "interrupted"
 """Status of a result whose search was interrupted."""
 
 
-class Question(NamedTuple):
-    """Question about a value that a record does not contain.
+class Measurement(NamedTuple):
+    """File that a study of the stage is fitted to.
 
-    ``text`` is the question, ``kind`` the type of the answer, and ``more`` the end of
-    the help text.
+    ``plant`` is the table of the study that names it, ``rate`` the sampling rate of the
+    loop, Hz, and ``text`` describes what was read. ``shown`` returns what the file
+    shows, from the answers to ``needed``.
     """
 
+    plant: dict[str, Any]
+    rate: float
     text: str
-    kind: type = float
-    more: str = ""
-
-
-QUESTIONS = {
-    "lower": Question("lower limit of the voltage [V]"),
-    "upper": Question("upper limit of the voltage [V]"),
-    "noise": Question("rms noise of the sensor [um]"),
-    "frequency": Question("frequency of the slowest reference [Hz]"),
-    "track": Question(
-        "references to track, with their frequencies in Hz",
-        str,
-        ", such as SIN10,PWSW40",
-    ),
-    "amplitude": Question("amplitude of the references, half of their range [um]"),
-    "offset": Question("lowest value of the references [um]"),
-    "slew": Question(
-        "fastest slew that the controller follows; jumps become ramps [um/s]"
-    ),
-    "controller": Question(
-        "controller to tune", str, ", such as inversion_pid or nv200"
-    ),
-    "scale": Question("scale of the gains of the device, 0 if unknown [V/um]"),
-    "lowest": Question("lowest position of the device's range [um]"),
-    "highest": Question("highest position of the device's range [um]"),
-}
-"""The questions by the name of their option; ``planned`` gives the defaults."""
-
-OF_DEVICES = ("scale", "lowest", "highest")
-"""Questions that only concern the controller of a vendor's device."""
-
-
-def questions(function: Callable) -> Callable:
-    """Add an option for each question of ``QUESTIONS``."""
-    for name, question in reversed(QUESTIONS.items()):
-        text = f"{question.text[0].upper()}{question.text[1:]}{question.more}."
-        function = click.option(
-            f"--{name}", type=question.kind, default=None, help=text
-        )(function)
-    return function
+    shown: "Callable[[dict[str, Any]], Shown]"
+    needed: tuple[str, ...] = ()
 
 
 @click.command(cls=Command)
@@ -84,11 +56,20 @@ def questions(function: Callable) -> Callable:
     type=click.Path(path_type=Path),
     help="Second record of the stage, which validates the model.",
 )
+@click.option(
+    "--response", is_flag=True, help="RECORD is a frequency response, not over time."
+)
+@click.option("--unit", help="Unit of the response, if its file has none  [um/V]")
+@click.option(
+    "--held",
+    is_flag=True,
+    help="The response was measured through the converters of the controller.",
+)
 @click.option("--yes", is_flag=True, help="Ask nothing; use the options and defaults.")
 @sliders_option
 @recognised_columns
 @common
-def main(record, model, check, yes, sliders, out, seed, quiet, **given):
+def main(record, response, yes, sliders, out, quiet, **given):
     """Tune a controller from a RECORD of your stage, and export its gains.
 
     The command asks for limits, sensor noise and references; the defaults come from
@@ -96,8 +77,12 @@ def main(record, model, check, yes, sliders, out, seed, quiet, **given):
     piezojax.tune can tune again, into the new folder. It does not export gains with an
     alarm. To go on after an interruption, give the same folder as --out.
 
+    With --response, RECORD is a frequency response; --rate, --lower, --upper and
+    --noise have no defaults then.
+
     Exit status 3 means that the gains have an alarm, as for piezojax.tune.
     """
+    measure = _response if response else _record
 
     def body(console):
         print_loading(console)
@@ -106,12 +91,11 @@ def main(record, model, check, yes, sliders, out, seed, quiet, **given):
 
         folder = out or numbered_folder(RESULTS / record.stem)
         study = folder / STUDY
-        options = {"model": model, "check": check, "seed": seed}
         if study.is_file():
-            _check_same(study, record, given, options)
+            _check_same(study, record, given, measure)
             console.print(f"going on in {folder} with its {STUDY}", soft_wrap=True)
         else:
-            _write_study(study, record, given, options, yes, console)
+            _write_study(study, measure(record, folder, given), given, yes, console)
         tuned, outcome = _finished(study, console), None
         if tuned is None:
             tuned = numbered_folder(folder / TUNED)
@@ -141,104 +125,115 @@ def main(record, model, check, yes, sliders, out, seed, quiet, **given):
     run(quiet, body)
 
 
+def _record(record: Path, folder: Path, given: dict[str, Any]) -> Measurement:
+    """Return what the file ``record`` measured, for a study in ``folder``.
+
+    Raises ValueError for options of a response, and as ``recognised`` and
+    ``read_record`` do.
+    """
+    from ..identification import DEFAULT
+    from ..identification.records.recognise import recognised
+    from ..identification.records.record import read_record
+    from ..study.first_plan import Shown
+    from ..study.first_study import plant_of_record
+
+    _refuse(given, OF_RESPONSES, "needs --response")
+    columns = recognised(record, {name: given[name] for name in OF_RECORDS})
+    loaded = read_record(record, **columns)
+    shown = Shown.by_record(loaded.in_units(("V",), ("um",)))
+    plant = plant_of_record(
+        record, columns, folder, model=given["model"] or DEFAULT, check=given["check"]
+    )
+    return Measurement(plant, 1.0 / loaded.dt, columns_of(loaded), lambda _: shown)
+
+
+def _response(response: Path, folder: Path, given: dict[str, Any]) -> Measurement:
+    """Return what the file ``response`` measured, for a study in ``folder``.
+
+    Raises ValueError for options of a record, without a rate, and as ``read_response``
+    does.
+    """
+    from ..identification.records.response_file import read_response
+    from ..study.first_plan import UNSHOWN, Shown
+    from ..study.first_study import plant_of_response
+    from ..study.origin import response_in_study_units
+
+    _refuse(
+        given,
+        [name for name in (*OF_RECORDS, "model", "check") if name != "rate"],
+        "is for a record over time, not for a --response",
+    )
+    rate = given["rate"]
+    if rate is None:
+        raise ValueError("--response needs a --rate: that of the controller, Hz")
+    loaded = response_in_study_units(read_response(response, unit=given["unit"]))
+    return Measurement(
+        plant_of_response(response, folder, unit=given["unit"], held=given["held"]),
+        rate,
+        f"read {response}: {loaded.frequency.size} lines from "
+        f"{loaded.frequency[0]:.4g} to {loaded.frequency[-1]:.4g} Hz",
+        partial(Shown.by_response, loaded, 1.0 / rate),
+        UNSHOWN,
+    )
+
+
+def _refuse(given: dict[str, Any], names: Iterable[str], reason: str) -> None:
+    """Raise ValueError if one of the options ``names`` is given."""
+    if found := _named(given, names):
+        raise ValueError(f"{found[0]} {reason}")
+
+
+def _named(given: dict[str, Any], names: Iterable[str]) -> list[str]:
+    """Return the options that have a value in ``given``, a flag if it is set."""
+    present = [n for n in names if given[n] is not None and given[n] is not False]
+    return [f"--{option(name)}" for name in present]
+
+
 def _write_study(
     study: Path,
-    record: Path,
+    measured: Measurement,
     given: dict[str, Any],
-    options: dict[str, Any],
     yes: bool,
     console: Console,
 ) -> None:
-    """Write the first ``study`` of ``record``; ask the ``QUESTIONS`` unless ``yes``."""
+    """Write the first ``study``; ask the ``QUESTIONS`` unless ``yes``."""
     from ..core.files import fresh_folder
-    from ..study.first_plan import doubts, planned
+    from ..study.first_plan import doubts
 
-    loaded, columns = _read(record, given)
-    print_columns(console, [loaded])
-    in_units = loaded.in_units(("V",), ("um",))
-    asked = {name: given[name] for name in QUESTIONS}
-    plan = planned(in_units, asked) if yes else _asked(in_units, asked)
-    text = _text_of(study, record, loaded, columns, plan, options)
+    console.print(measured.text, soft_wrap=True, markup=False)
+    plan = _plan(measured, given, yes)
+    text = _text_of(measured, plan, given)
     fresh_folder(study.parent)
     write_text(study, text)
     for name, question in QUESTIONS.items():
-        if _concerns(name, plan):
+        if concerns(name, plan):
             console.print(f"{question.text}: {getattr(plan, name)}", soft_wrap=True)
-    for doubt in doubts(plan, in_units):
+    for doubt in doubts(plan, measured.shown(given | vars(plan))):
         console.print(f"note: {doubt}", soft_wrap=True)
     console.print(f"wrote {study}", soft_wrap=True)
 
 
-def _read(record: Path, given: dict[str, Any]) -> "tuple[Record, dict[str, Any]]":
-    """Return the Record in the file ``record``, and the columns that it was read by."""
-    from ..identification.records.recognise import recognised
-    from ..identification.records.record import read_record
-
-    columns = recognised(
-        record, {name: value for name, value in given.items() if name not in QUESTIONS}
-    )
-    return read_record(record, **columns), columns
-
-
-def _text_of(
-    study: Path,
-    record: Path,
-    loaded: "Record",
-    columns: dict[str, Any],
-    plan: "Plan",
-    options: dict[str, Any],
-) -> str:
-    """Return the text of the ``study`` of ``plan``; ``options`` are those of main."""
-    from ..identification import DEFAULT
-    from ..study.first_study import first_study
-
-    return first_study(
-        plan,
-        record,
-        columns,
-        1.0 / loaded.dt,
-        folder=study.parent,
-        model=options["model"] or DEFAULT,
-        check=options["check"],
-        seed=options["seed"] or 0,
-    )
-
-
-def _asked(record: "Record", given: dict[str, Any]) -> "Plan":
-    """Ask the questions that ``given`` does not answer, and return the Plan.
-
-    A question is repeated after an invalid answer. Raises ValueError, naming the
-    option, if the input ends before all are answered.
-    """
+def _plan(measured: Measurement, given: dict[str, Any], yes: bool = True) -> "Plan":
+    """Return the Plan of the options ``given`` and of the answers, unless ``yes``."""
     from ..study.first_plan import planned
 
-    plan, answers = planned(record, given), dict(given)
-    for name, question in QUESTIONS.items():
-        while answers[name] is None and _concerns(name, plan):
-            try:
-                answer = click.prompt(question.text, default=getattr(plan, name))
-            except click.Abort:
-                raise ValueError(
-                    f"no answer for the {question.text}: give it as --{name}, or "
-                    "--yes for all defaults"
-                ) from None
-            try:
-                plan = planned(record, answers | {name: answer})
-                answers[name] = answer
-            except ValueError as error:
-                click.echo(f"{error}")
-    return plan
+    answers = {name: given[name] for name in QUESTIONS}
+    if yes:
+        return planned(measured.shown(answers), answers)
+    return asked(measured.shown, answers, measured.needed)
 
 
-def _concerns(name: str, plan: "Plan") -> bool:
-    """Return whether a question matters for the controller of ``plan``."""
-    from ..study.first_plan import DEVICES
+def _text_of(measured: Measurement, plan: "Plan", given: dict[str, Any]) -> str:
+    from ..study.first_study import first_study
 
-    return name not in OF_DEVICES or plan.controller in DEVICES
+    return first_study(plan, measured.plant, measured.rate, seed=given["seed"] or 0)
 
 
 def _check_same(
-    study: Path, record: Path, given: dict[str, Any], options: dict[str, Any]
+    study: Path,
+    record: Path,
+    given: dict[str, Any],
+    measure: Callable[[Path, Path, dict[str, Any]], Measurement],
 ) -> None:
     """Raise ValueError if ``study`` has another record, or follows other options.
 
@@ -246,19 +241,16 @@ def _check_same(
     """
     from ..core.files import seen_from
     from ..study import load
-    from ..study.first_plan import planned
 
-    known = load(study).plant.get("record", [])  # a study may name a model instead
+    plant = load(study).plant  # it may name a model instead
+    known = plant.get("record", plant.get("response", []))
     known = known if isinstance(known, list) else [known]
-    every = given | options
-    named = [f"--{name}" for name, value in every.items() if value is not None]
+    named = _named(given, given)
     if seen_from(study.parent, record) not in known:
         named = [str(record)]
     elif named:
-        loaded, columns = _read(record, given)
-        asked = {name: given[name] for name in QUESTIONS}
-        plan = planned(loaded.in_units(("V",), ("um",)), asked)
-        text = _text_of(study, record, loaded, columns, plan, options)
+        measured = measure(record, study.parent, given)
+        text = _text_of(measured, _plan(measured, given), given)
         if text == study.read_text(encoding="utf-8"):
             return
     if named:

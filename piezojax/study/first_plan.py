@@ -7,6 +7,7 @@ import numpy as np
 
 from ..identification import Record
 from ..identification.records.recognise import noise_rms
+from ..identification.records.response import FrequencyResponse
 from ..signals import signal, time_grid
 from ..signals.waveforms import parse
 from .designs import ALL_DESIGNS
@@ -63,6 +64,57 @@ UNSEEN = ("SIN", "SCAN")
 
 
 @dataclass(frozen=True)
+class Shown:
+    """What a measurement shows of a stage.
+
+    ``inputs`` (V) and ``outputs`` (um) are the lowest and highest values, ``dt`` is the
+    sample time of the loop, s, ``noise`` the rms noise of the sensor, um, and ``slew``
+    the largest slew rate of the voltage, V/s. The last two are None if a measurement
+    does not show them.
+    """
+
+    inputs: tuple[float, float]
+    outputs: tuple[float, float]
+    dt: float
+    noise: float | None = None
+    slew: float | None = None
+
+    @classmethod
+    def by_record(cls, record: Record) -> "Shown":
+        """Return what ``record``, in V and um, shows; the noise is ``noise_rms``."""
+        return cls(
+            (float(record.input.min()), float(record.input.max())),
+            (float(record.output.min()), float(record.output.max())),
+            record.dt,
+            noise_rms(record),
+            float(record.slews[0]),
+        )
+
+    @classmethod
+    def by_response(
+        cls, response: FrequencyResponse, dt: float, answers: dict[str, Any]
+    ) -> "Shown":
+        """Return what ``response``, in um/V, and the answers to UNSHOWN show.
+
+        The displacement is that of the response at the lowest frequency.
+
+        Raises ValueError if one of UNSHOWN is not in ``answers``.
+        """
+        if missing := [name for name in UNSHOWN if answers.get(name) is None]:
+            named = " and ".join(f"--{name}" for name in missing)
+            raise ValueError(f"a frequency response does not show these: give {named}")
+        lower, upper = answers["lower"], answers["upper"]
+        slowest = response.values[0]
+        gain = float(np.copysign(np.abs(slowest), slowest.real))
+        low, high = sorted((gain * lower, gain * upper))
+        return cls((lower, upper), (low, high), dt)
+
+
+UNSHOWN = "lower", "upper", "noise"
+"""Answers that a frequency response does not suggest."""
+
+
+@dataclass(frozen=True)
 class Plan:
     """Values that a first study needs besides a record, in V, um and Hz.
 
@@ -72,7 +124,9 @@ class Plan:
     ``offset + 2 amplitude``. The controller follows at most the slew ``slew``, um/s: it
     sees faster references, such as jumps, as ramps. ``controller`` is the name of a
     design. For a device, ``scale`` is that of its gains (V/um; 0 if it is unknown and
-    to be assumed), and its positions range from ``lowest`` to ``highest``. Raises
+    to be assumed), and its positions range from ``lowest`` to ``highest``.
+    ``slew_rate`` is that of the amplifier, V/s; if it is 0, it is unknown, and the
+    voltage is to move at most at ``recorded_slew``, V/s, if that is not 0. Raises
     ValueError for values that no stage can have, and for unknown references or designs.
     """
 
@@ -88,6 +142,8 @@ class Plan:
     scale: float = 0.0
     lowest: float = 0.0
     highest: float = 1.0
+    slew_rate: float = 0.0
+    recorded_slew: float = 0.0
 
     def __post_init__(self):
         one_of(self.controller, ALL_DESIGNS)
@@ -100,7 +156,7 @@ class Plan:
                 raise ValueError(
                     f"{name} is {getattr(self, name):g} {unit}; it must be above 0"
                 )
-        for name, unit in (("noise", "um"), ("scale", "V/um")):
+        for name, unit in (("noise", "um"), ("scale", "V/um"), ("slew_rate", "V/s")):
             if getattr(self, name) < 0.0:
                 raise ValueError(
                     f"{name} is {getattr(self, name):g} {unit}; it must be at least 0"
@@ -130,53 +186,55 @@ class Plan:
         return [name for name in doubled if name not in self.tracked]
 
 
-def planned(record: Record, given: dict[str, Any]) -> Plan:
-    """Return the Plan that ``record``, in V and um, suggests.
+def planned(shown: Shown, given: dict[str, Any]) -> Plan:
+    """Return the Plan that a measurement, ``shown``, suggests.
 
     Values of ``given`` that are not None replace the suggested ones. The limits are the
-    lowest and highest recorded voltage, the noise comes from ``noise_rms``, and the
-    references lie around the middle of the recorded displacements. The slowest has at
-    least ``SAMPLES_A_PERIOD`` samples in a period, and needs at most ``RECORDED`` times
-    the largest slew of the record. The limit of the slew is ``FASTER`` times the
-    largest slew of the references.
+    lowest and highest voltage, and the references lie around the middle of the
+    displacements. The slowest has at least ``SAMPLES_A_PERIOD`` samples in a period,
+    and needs at most ``RECORDED`` times the largest slew that is shown, which is
+    ``recorded_slew``. The limit of the slew is ``FASTER`` times the largest slew of the
+    references.
 
-    Raises ValueError as ``Plan`` does, and for references outside the record.
+    Raises ValueError as ``Plan`` does, and for references outside the displacements.
     """
     known = {name: value for name, value in given.items() if value is not None}
-    low, high = record.output.min(), record.output.max()
+    low, high = shown.outputs
     amplitude = known.get("amplitude", _rounded(SHARE * (high - low)))
 
     def plan_of(frequency: float) -> Plan:
         suggested = {
-            "lower": _rounded(float(record.input.min())),
-            "upper": _rounded(float(record.input.max())),
-            "noise": _rounded(noise_rms(record)),
+            "lower": _rounded(shown.inputs[0]),
+            "upper": _rounded(shown.inputs[1]),
+            "noise": _rounded(shown.noise or 0.0),
             "frequency": frequency,
             "track": f"SIN{frequency:g},PWSW{4.0 * frequency:g}",
             "amplitude": amplitude,
             "offset": _rounded(0.5 * (low + high) - amplitude),
             "slew": 1.0,  # until the references are known
-            "lowest": _rounded(float(low)),
-            "highest": _rounded(float(high)),
+            "lowest": _rounded(low),
+            "highest": _rounded(high),
+            "recorded_slew": _rounded(shown.slew or 0.0),
         }
         return Plan(**(suggested | known))
 
-    highest = 1.0 / (SAMPLES_A_PERIOD * record.dt)
+    highest = 1.0 / (SAMPLES_A_PERIOD * shown.dt)
     plan = plan_of(known.get("frequency", _round_below(highest)))
-    if "frequency" not in known:
-        recorded = RECORDED * record.slews[0] * record.span / np.ptp(record.input)
-        fastest = FASTER * _fastest(plan, record.dt)
+    if "frequency" not in known and shown.slew is not None:
+        gain = (high - low) / (shown.inputs[1] - shown.inputs[0])
+        recorded = RECORDED * shown.slew * gain
+        fastest = FASTER * _fastest(plan, shown.dt)
         if fastest > recorded:
             plan = plan_of(_round_below(plan.frequency * recorded / fastest))
     if "slew" not in known:
-        plan = replace(plan, slew=_rounded(FASTER * _fastest(plan, record.dt)))
+        plan = replace(plan, slew=_rounded(FASTER * _fastest(plan, shown.dt)))
     least, most = plan.offset, plan.offset + 2.0 * plan.amplitude
     beyond = BEYOND * (high - low)
     if least < low - beyond or most > high + beyond:
         raise ValueError(
             f"the references cover {least:.4g} to {most:.4g} um (offset to offset + 2 "
-            f"amplitude), the record {low:.4g} to {high:.4g} um: change amplitude or "
-            "offset, or record the whole range"
+            f"amplitude), the measured stage {low:.4g} to {high:.4g} um: change "
+            "amplitude or offset, or measure the whole range"
         )
     return plan
 
@@ -191,33 +249,33 @@ def _fastest(plan: Plan, dt: float) -> float:
     )
 
 
-def doubts(plan: Plan, record: Record) -> list[str]:
-    """Return a sentence on each answer of ``plan`` that ``record`` contradicts."""
-    low, high = float(record.input.min()), float(record.input.max())
+def doubts(plan: Plan, shown: Shown) -> list[str]:
+    """Return a sentence on each answer of ``plan`` that the measurement contradicts."""
     found = []
+    low, high = shown.inputs
     beyond = BEYOND * (high - low)
     if plan.lower < low - beyond or plan.upper > high + beyond:
         found.append(
             f"the voltage may reach {plan.lower:g} to {plan.upper:g} V, but the record "
             f"covers {low:.4g} to {high:.4g} V: outside it the model extrapolates"
         )
-    measured, span = noise_rms(record), float(np.ptp(record.output))
+    measured, span = shown.noise, shown.outputs[1] - shown.outputs[0]
     if plan.noise > NOISY * span:
         found.append(
             f"a noise of {plan.noise:g} um rms is {100.0 * plan.noise / span:.3g} % of "
             "the recorded span: is it in um, and the rms value?"
         )
-    elif plan.noise > LOUD * measured:
+    elif measured is not None and plan.noise > LOUD * measured:
         found.append(
             f"the record shows a noise of about {measured:.2g} um rms, and "
             f"{plan.noise:g} um are given: are they in um?"
         )
-    elif plan.noise < 0.1 * measured:
+    elif measured is not None and plan.noise < 0.1 * measured:
         found.append(
             f"the record shows a noise of about {measured:.2g} um rms, more than the "
             f"{plan.noise:g} um given: the gains may amplify it"
         )
-    if measured < QUIET * span:
+    if measured is not None and measured < QUIET * span:
         found.append(
             f"the record shows a noise of about {measured:.2g} um rms, less than that "
             "of any sensor: if the displacement was smoothed before it was saved, use "

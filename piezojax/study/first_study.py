@@ -14,49 +14,72 @@ from ..identification import DEFAULT
 from .first_plan import DEVICES, MEASURE, PERIODS, Plan
 
 
-def first_study(
-    plan: Plan,
+def plant_of_record(
     record: Path,
     columns: dict[str, Any],
-    rate: float,
-    *,
     folder: Path,
+    *,
     model: str = DEFAULT,
     check: Path | None = None,
-    seed: int = 0,
-) -> str:
-    """Return the text of a study of ``plan``, with comments.
+) -> dict[str, Any]:
+    """Return the table ``[plant]`` of a study in ``folder``, fitted to ``record``.
 
-    The paths in it are relative to ``folder``, where the study is to be written.
-    ``record`` and the optional ``check`` are files of records, and ``columns`` are the
-    options of ``read_record`` for both; ``rate`` is the sampling rate of the loop, Hz,
-    and ``model`` the model to fit. Raises ValueError for a device at another rate than
-    its own, and for an E-727 without the scale of its gains.
+    ``columns`` are the options of ``read_record`` for ``record`` and for ``check``, an
+    optional second record; ``model`` is the model to fit.
     """
-    if plan.controller == "e727" and plan.scale == 0.0:
-        raise ValueError(
-            f"the E-727 needs the scale of its gains: {MEASURE.format('e727')}"
-        )
     keys = {"rate": "record_rate"}
-    device = plan.controller in DEVICES
-    if device and not np.isclose(rate * FIXED_DT, 1.0, rtol=1e-9):
-        raise ValueError(
-            f"the record has {rate:g} Hz, the device {1.0 / FIXED_DT:g} Hz: record at "
-            "that rate, because the interpolation by --resample would look like a "
-            "resonance above half the rate of the record"
-        )
-    plant = {
+    return {
         "record": seen_from(folder, record),
         "model": model,
         **{keys.get(k, k): v for k, v in columns.items() if v is not None},
         **({"check": seen_from(folder, check)} if check else {}),
     }
+
+
+def plant_of_response(
+    response: Path, folder: Path, *, unit: str | None = None, held: bool = False
+) -> dict[str, Any]:
+    """Return the table ``[plant]`` of a study in ``folder``, fitted to ``response``.
+
+    ``response`` is a file of a frequency response; ``unit`` and ``held`` are the keys
+    of that name.
+    """
+    return {
+        "response": seen_from(folder, response),
+        **({"unit": unit} if unit else {}),
+        **({"held": True} if held else {}),
+    }
+
+
+def first_study(
+    plan: Plan, plant: dict[str, Any], rate: float, *, seed: int = 0
+) -> str:
+    """Return the text of a study of ``plan``, with comments.
+
+    ``plant`` is the table of ``plant_of_record`` or ``plant_of_response``, and ``rate``
+    the sampling rate of the loop, Hz. Raises ValueError for a device at another rate
+    than its own, and for an E-727 without the scale of its gains.
+    """
+    if plan.controller == "e727" and plan.scale == 0.0:
+        raise ValueError(
+            f"the E-727 needs the scale of its gains: {MEASURE.format('e727')}"
+        )
+    measured = "record" if "record" in plant else "response"
+    device = plan.controller in DEVICES
+    if device and not np.isclose(rate * FIXED_DT, 1.0, rtol=1e-9):
+        raise ValueError(_OTHER_RATE[measured].format(rate, 1.0 / FIXED_DT))
+    slew_rate, peak_slew = _slew_limits(plan)
     values = {
         **{field.name: _toml(getattr(plan, field.name)) for field in fields(plan)},
-        "title": _toml(f"{plan.controller} on the stage of {record.name}"),
+        "title": _toml(
+            f"{plan.controller} on the stage of {Path(plant[measured]).name}"
+        ),
         "rate": _toml(rate),
         "seed": _toml(seed),
+        "fitted": _FITTED[measured],
         "plant": "\n".join(f"{key} = {_toml(value)}" for key, value in plant.items()),
+        "slew_rate": slew_rate,
+        "peak_slew": peak_slew,
         "controller": _controller(plan, 1.0 / rate),
         "parameters": _parameters(plan.controller),
         "tune": _toml(plan.tracked),
@@ -66,6 +89,25 @@ def first_study(
     }
     return _TEXT.substitute(values)
 
+
+_OTHER_RATE = {
+    "record": "the record has {:g} Hz, the device {:g} Hz: record at that rate, "
+    "because the interpolation by --resample would look like a resonance above half "
+    "the rate of the record",
+    "response": "--rate is {:g} Hz, but the device has {:g} Hz",
+}
+
+_FITTED = {
+    "record": """\
+# The model is fitted to the first half of the record and validated on the second. A
+# second record, as check = "other.csv", shows whether the model still holds.
+""",
+    "response": """\
+# The modes, lags and delay are fitted to the frequency response, and the margins are
+# also computed on its points. It shows small motions: hysteresis and creep are not in
+# this model.
+""",
+}
 
 _TEXT = Template("""\
 # First study of a stage, written by python -m piezojax.start. To tune again after a
@@ -77,16 +119,14 @@ rate = $rate # of the loop
 seed = $seed
 
 $parameters
-# The model is fitted to the first half of the record and validated on the second. A
-# second record, as check = "other.csv", shows whether the model still holds.
-[plant]
+$fitted[plant]
 $plant
 
-# Limits of the voltage. Outside the recorded voltages the model extrapolates.
+# Limits of the voltage. Outside the measured voltages the model extrapolates.
 [actuator]
 lower = $lower
 upper = $upper
-
+$slew_rate
 # RMS noise of the sensor. Bandwidth, delay and bits may be given too.
 [sensor]
 noise_rms = $noise
@@ -108,7 +148,7 @@ settle = $settle
 # limits here: settling_time = 0.01, or, if the slew is not limited, closed_loop_peak =
 # 1.5.
 [constraints]
-
+$peak_slew
 [optimiser]
 method = "gauss_newton"
 starts = 2
@@ -153,6 +193,26 @@ _WITHIN = """
 # These parameters stay within a factor of the values of the design.
 [parameters]
 """
+
+
+_AMPLIFIER = """\
+slew_rate = {!r} # of the amplifier, V/s
+"""
+
+_AS_RECORDED = """\
+# Largest slew rate of the voltage in the record, V/s: the amplifier may not follow
+# faster motions. If its slew rate is known, set actuator.slew_rate instead.
+peak_slew = {!r}
+"""
+
+
+def _slew_limits(plan: Plan) -> tuple[str, str]:
+    """Return the keys for the slew rate in ``[actuator]`` and in ``[constraints]``."""
+    if plan.slew_rate > 0.0:
+        return _AMPLIFIER.format(plan.slew_rate), ""
+    if plan.recorded_slew > 0.0:
+        return "", _AS_RECORDED.format(plan.recorded_slew)
+    return "", ""
 
 
 def _parameters(controller: str) -> str:

@@ -192,7 +192,7 @@ def _warnings(
             for text in report.warnings
             if text not in report.alarms
         ]
-    found += unchecked(case.plant_about)
+    found += unchecked(case.plant_about, case.response is not None)
     if levels := levels_of(case.loop.plant):
         found.append(
             f"the plant is scheduled by the level of its drive: limits on margins hold "

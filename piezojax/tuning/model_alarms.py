@@ -102,13 +102,29 @@ def _error_alarm(
         )
 
 
-def unchecked(about: About) -> list[str]:
-    """Return a note if a fitted model was never checked on a second record."""
+def unchecked(about: About, response: bool = False) -> list[str]:
+    """Return a note if a fitted model was never checked on a second record.
+
+    ``response`` is whether the plant of the study is fitted to a frequency response.
+    """
     if about.record is None or about.checked:
         return []
+    second, advice = _AGAIN["response" if response else "record"]
     return [
         f"the model of the plant was fitted to {about.record} and never checked on a "
-        "second record: nothing shows that it holds for this stage today; record the "
-        "stage again and name the file in plant.check, or for a plant from a file run "
-        "python -m piezojax.validate"
+        f"second {second}: nothing shows that it holds for this stage today; {advice}"
     ]
+
+
+_AGAIN = {
+    "record": (
+        "record",
+        "record the stage again and name the file in plant.check, or for a plant from "
+        "a file run python -m piezojax.validate",
+    ),
+    "response": (
+        "response",
+        "measure it again and compare both with python -m piezojax.identify --response",
+    ),
+}
+"""What a second measurement is called, and how it is compared."""

@@ -243,12 +243,6 @@ def start(folder, page):
 
 def devices(folder, page):
     write_response(folder / "bench.csv")
-    example = (folder / "tuning/nv200.toml").read_text("utf-8")
-    first = example.partition("[plant]")[0]
-    optimiser = example[example.index("[optimiser]") :]
-    tables = blocks_in(page, "toml")[0]
-    study = f"{first}{tables}\n{optimiser}"
-    (folder / "stage.toml").write_text(study, encoding="utf-8")
     ranges = {"avmin": -20.0, "avmax": 130.0, "posmin": 0.0, "posmax": 12.0}
     controller = pj.control.NV200(0.06, 70.0, 0.0, scale=10.8, **ranges)
     columns = {

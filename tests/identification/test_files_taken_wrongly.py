@@ -117,7 +117,7 @@ def test_a_frequency_response_is_pointed_to_its_option(tmp_path):
     columns = np.c_[np.geomspace(5.0, 500.0, 40), np.zeros(40), np.ones(40)]
     header = "Frequency (Hz),Magnitude (dB),Phase (deg)"
     np.savetxt(path, columns, delimiter=",", header=header, comments="")
-    message = "; a frequency response is fitted by identify --response"
+    message = "; for a frequency response, identify and start have"
     with pytest.raises(ValueError, match=message):
         recognised(path, dict.fromkeys(("time", "input", "output", "rate")))
     with pytest.raises(ValueError, match=message):

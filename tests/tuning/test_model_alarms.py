@@ -100,3 +100,6 @@ def test_an_unchecked_model_has_a_note():
     assert "plant.check" in note
     assert unchecked(About(record="bench.csv", checked=["today.csv"])) == []
     assert unchecked(About()) == []
+    (note,) = unchecked(About(record="bench.csv"), response=True)
+    assert "never checked on a second response" in note
+    assert "piezojax.identify --response" in note

@@ -124,7 +124,9 @@ def read_plain_columns(
 def response_hint(columns: Columns) -> str:
     """Return the end of a message on a file that may hold a frequency response."""
     if any(unit_of(name, column) == "Hz" for name, column in columns.items()):
-        return "; a frequency response is fitted by identify --response"
+        return (
+            "; for a frequency response, identify and start have the option --response"
+        )
     return ""
 
 
