@@ -129,6 +129,12 @@ def test_extremes_cover_the_whole_run():
         np.min(run.reference) - np.min(run.displacement),
     )
     np.testing.assert_allclose(found.peak_slew, np.abs(np.diff(run.voltage)).max())
+    changes = np.abs(np.diff(run.voltage))
+    start = int(np.argmax(changes)) + 1  # leaves the largest change out
+    later = figures(Extremes(start), run)
+    np.testing.assert_allclose(later.peak_slew, changes[start:].max())
+    assert later.peak_slew < found.peak_slew
+    assert later.overshoot == found.overshoot
     np.testing.assert_allclose(found.overshoot, beyond / swing, rtol=1e-12)
     assert beyond > 0.0
 

@@ -231,7 +231,7 @@ CONSTRAINTS: dict[str, Constraint] = {
         "at most",
         "extremes",
         lambda found, dt: _largest(found.peak_slew) / dt,
-        meaning="Largest rate of the voltage in the runs",
+        meaning="Largest rate of the voltage in the runs, after references.settle",
     ),
     "effort": Constraint(
         "V rms",

@@ -90,7 +90,8 @@ class Tracking(Metric):
 class ExtremeFigures(NamedTuple):
     """Extremes of one run of a loop.
 
-    ``peak_slew`` is the largest change of the voltage between two samples, V.
+    ``peak_slew`` is the largest change of the voltage between two samples of the
+    window, V.
     ``overshoot`` is the excess of the displacement over the highest reference or below
     the lowest one, whichever is larger, as a share of the range of the reference; it is
     0 for a constant reference.
@@ -101,7 +102,13 @@ class ExtremeFigures(NamedTuple):
 
 
 class Extremes(Metric):
-    """Metric of the largest voltage change and the overshoot over the whole run."""
+    """Metric of the largest voltage change, and of the overshoot over the whole run.
+
+    ``start`` is the first sample of the window of the voltage change: a run begins with
+    a step, if a disturbance does not begin at 0.
+    """
+
+    start: int = eqx.field(static=True, default=0)
 
     def init(self) -> State:
         zero, least = jnp.zeros(()), jnp.asarray(-jnp.inf)
@@ -115,7 +122,7 @@ class Extremes(Metric):
         }
 
     def update(self, total: State, index: Array, output: LoopSample) -> State:
-        first = index == 0
+        first = index <= self.start
         change = output.voltage - jnp.where(first, output.voltage, total["last"])
         return {
             "slew": jnp.maximum(total["slew"], jnp.abs(change)),

@@ -117,7 +117,7 @@ class Evaluator:
     def _runs(
         self, loop: Feedback, signals: Signals, stages: Stage | None
     ) -> tuple[TrackingFigures, ExtremeFigures | None]:
-        beside = Extremes() if uses(self.limits, "extremes") else None
+        beside = Extremes(self.start) if uses(self.limits, "extremes") else None
         stages = held(own_stage(loop) if stages is None else stages, signals.begins)
         width = min(RUN_BLOCK, self._most)
         found = self._on_each(

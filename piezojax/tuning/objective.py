@@ -200,7 +200,7 @@ class Objective(eqx.Module):
     def _sampled(
         self, unit: Float[Array, " n"], every: int = 1
     ) -> tuple[LoopFigures, Array | None]:
-        beside = Extremes() if uses(self.limits, "extremes") else None
+        beside = Extremes(self.start) if uses(self.limits, "extremes") else None
 
         def loop_of(unit, stage):
             loop = self.space.put(self.loop, unit)
