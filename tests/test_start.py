@@ -569,7 +569,7 @@ def test_a_changed_study_is_tuned_again(run, tmp_path):
     run("--yes")
     path = tmp_path / "out" / "study.toml"
     text = path.read_text(encoding="utf-8")
-    path.write_text(text.replace("steps = 40", "steps = 41"), encoding="utf-8")
+    path.write_text(text.replace("steps = 80", "steps = 81"), encoding="utf-8")
     status, _, calls = run()
     assert (status, calls) == (0, [("tune", "tuned-2"), ("export", "tuned-2", "c")])
     assert (tmp_path / "out" / "controller-2" / "Makefile").is_file()

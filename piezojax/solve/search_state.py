@@ -40,6 +40,11 @@ class SearchState:
         times = self.history.times_s
         return times[len(times) - len(self.losses_by_start) :]
 
+    @property
+    def rank(self) -> float:
+        """Rank of the best point: its loss, or a larger number if it violates."""
+        return float(_rank(self.loss, self.violation))
+
     def update_best(
         self, units: np.ndarray, verdict: Verdict, evaluations: int | None = None
     ) -> None:
@@ -55,7 +60,7 @@ class SearchState:
         self.evaluations += taken
         best = float(ranks[leader])
         self.history.add(taken, best if best < VIOLATED else np.inf)
-        if best < _rank(self.loss, self.violation):
+        if best < self.rank:
             self.loss = float(verdict.loss[leader])
             self.violation = float(verdict.violation[leader])
             self.unit = units[leader]

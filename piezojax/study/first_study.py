@@ -151,9 +151,9 @@ settle = $settle
 $peak_slew
 [optimiser]
 method = "gauss_newton"
-starts = 2
-candidates = 32
-steps = 40
+starts = 4
+candidates = 64
+steps = 80
 """)
 
 

@@ -67,8 +67,9 @@ def search_within_limits(
         search.status = "interrupted"
         return objective, search, strategy, INTERRUPTED
     every = every.on_margin_stages(carried.stages)
-    again, strategy = search_box(every, case, progress, known=search.unit)
+    again, strategy = search_box(every, case, progress)
     again.evaluations += search.evaluations
+    again = _or_from(search.unit, every, case, again, strategy, progress)
     return _repeated(every, case, evaluator, carried, again, strategy, progress)
 
 
@@ -108,6 +109,45 @@ def _alarming_peak(case: Case, stability: StabilityReports) -> float:
     return max(nominal, worst) if alarming else 0.0
 
 
+def _or_from(
+    unit: np.ndarray,
+    objective: Objective,
+    case: Case,
+    search: SearchState,
+    strategy: Strategy | None,
+    progress: Progress,
+) -> SearchState:
+    """Return ``search``, or a descent from ``unit`` alone if it ends better.
+
+    Among the starts of the search, a cut would drop a point that violates the limits.
+    """
+    if strategy is None or search.status == "interrupted":
+        return search
+    progress.stage("searching from the gains without the limits")
+    try:
+        other = _descent(unit, objective, case, strategy, progress)
+    except KeyboardInterrupt:
+        search.status = "interrupted"
+        return search
+    other.evaluations += search.evaluations
+    search.evaluations = other.evaluations
+    return min(search, other, key=lambda state: state.rank)
+
+
+def _descent(
+    unit: np.ndarray,
+    objective: Objective,
+    case: Case,
+    strategy: Strategy,
+    progress: Progress,
+) -> SearchState:
+    """Return the search from one start."""
+    search = SearchState(unit, starts=unit[None])
+    steps = case.study.optimiser.steps
+    minimise(strategy, objective, search.starts, search, steps, progress)
+    return search
+
+
 def _repeated(
     objective: Objective,
     case: Case,
@@ -143,9 +183,7 @@ def _repeated(
                 objective = objective.on_margin_stages(carried.stages)
             elif not peak:
                 break
-            again = SearchState(search.unit, starts=search.unit[None])
-            steps = case.study.optimiser.steps
-            minimise(strategy, objective, again.starts, again, steps, progress)
+            again = _descent(search.unit, objective, case, strategy, progress)
             again.evaluations += search.evaluations
             search, stability = again, exact_stability(case, again)
     except KeyboardInterrupt:

@@ -58,12 +58,10 @@ def search_box(
     case: Case,
     progress: Progress,
     also: np.ndarray | None = None,
-    known: np.ndarray | None = None,
 ) -> tuple[SearchState, Strategy | None]:
     """Return the search with the best point of the case's box, and its strategy.
 
-    ``also`` are further points [points, n] that may become starts; ``known`` [n] is a
-    start in any case, unless its loop is not stable.
+    ``also`` are further points [points, n] that may become starts.
     ``Ctrl-C`` ends the search with the best point so far; the strategy is None if it
     has not been compiled. Raises ValueError if the loop diverges or stays at a voltage
     limit at every point tried.
@@ -72,17 +70,13 @@ def search_box(
     search = SearchState(own, starts=own[None])
     inner, strategy = search.history.clock, None
     try:
-        more = [also, None if known is None else known[None]]
-        points = np.concatenate(
-            [candidates(case), *(part for part in more if part is not None)]
-        )
+        points = candidates(case)
+        points = points if also is None else np.concatenate([points, also])
         progress.stage(f"screening {len(points)} points of the box")
         strategy = make_strategy(objective, case, inner)
         try:
             losses, verdict = strategy.screen(objective, points)
             chosen = _starts(losses, table.starts, search)
-            if known is not None and losses[-1] < FAILED_LOSS:
-                chosen = np.union1d(chosen, losses.size - 1)
             search.update_best(points, verdict)
             search.starts = points[chosen]
         finally:

@@ -1,6 +1,5 @@
 """Default limits: kept if active, without effect if not, off on request."""
 
-import numpy as np
 import pytest
 import tomli_w
 
@@ -61,20 +60,21 @@ def test_the_defaults_hold_where_unlimited_gains_violate_them(free, safe):
     assert safe.result.after.worst_rms_um > free.result.after.worst_rms_um
 
 
-def test_the_search_within_the_limits_also_begins_at_the_gains_without(
-    tmp_path, monkeypatch
+def test_the_search_within_the_limits_also_descends_from_the_gains_without(
+    tmp_path, monkeypatch, safe
 ):
     searches = []
 
-    def spied(*args, **options):
-        found = search_box(*args, **options)
-        searches.append(found[0])
-        return found
+    def stuck_the_second_time(*args, **options):
+        search, strategy = search_box(*args, **options)
+        searches.append(search)
+        if len(searches) == 2:
+            search.unit, search.loss = search.starts[0], 0.0
+        return search, strategy
 
-    monkeypatch.setattr(limited_search, "search_box", spied)
-    outcome = tuned(tmp_path)
-    free, safe = searches
-    assert len(free.starts) == 1
-    assert safe.starts.shape == (2, 1)
-    np.testing.assert_array_equal(safe.starts[1], free.unit)
-    assert outcome.result.constraints["sensitivity_peak"].kept
+    monkeypatch.setattr(limited_search, "search_box", stuck_the_second_time)
+    result = tuned(tmp_path).result
+    assert len(searches) == 2
+    assert result.constraints["sensitivity_peak"].kept
+    assert result.after.worst_rms_um < 1.01 * safe.result.after.worst_rms_um
+    assert result.after.worst_rms_um < 0.9 * result.before.worst_rms_um
