@@ -33,7 +33,7 @@ from piezojax.study import (
 from piezojax.study.stage_tables import AxesTable
 from piezojax.study.study_file import _FILES
 from piezojax.tuning.data import make_data
-from piezojax.tuning.make_result import _residual_notes
+from piezojax.tuning.make_result import _hysteresis_notes, _residual_notes
 from piezojax.tuning.response_margins import margins_on_response
 from piezojax.tuning.tuner import _model_alarms
 from piezojax.tuning.unexplained import residual_disturbances
@@ -375,6 +375,39 @@ def test_a_plant_from_a_response(tmp_path, monkeypatch):
     assert found["after"].lines == 120
     peak = np.max(1.0 / np.abs(1.0 + loop.response(angle) * ratio))
     assert found["after"].sensitivity_peak == pytest.approx(peak)
+
+
+def test_a_plant_from_a_response_is_assumed_to_lack_hysteresis(tmp_path, monkeypatch):
+    monkeypatch.setattr("piezojax.identification.response_model.modal_fit", wrong_fit)
+    response_file(tmp_path)
+    table = {"response": "bench.csv", "unit": "nm/V"}
+    fitted = build(study_of(plant=table), tmp_path / "study.toml")
+    path = tmp_path / "model.json"
+    pj.save(fitted.loop.plant, path, about=fitted.plant_about)
+    loaded = build(study_of(plant={"file": path.name}), tmp_path / "study.toml")
+    for case in (fitted, loaded):
+        assert case.assumed_hysteresis == 0.15
+        (note,) = _hysteresis_notes(case)
+        assert "a loop whose width is 15 % of its height" in note
+        assert "limits on margins also hold at its largest gain" in note
+        assert make_data(case).tuning.disturbance is not None
+    off = study_of(plant=table, disturbance={"hysteresis": 0.0})
+    case = build(off, tmp_path / "study.toml")
+    assert case.assumed_hysteresis == 0.0
+    (note,) = _hysteresis_notes(case)
+    assert "the errors hold for a stage without hysteresis" in note
+    assert make_data(case).tuning.disturbance is None
+
+
+def test_other_plants_lack_hysteresis_only_if_the_study_says_so(case, tmp_path):
+    assert case.assumed_hysteresis == 0.0
+    assert _hysteresis_notes(case) == []
+    plant = {"type": "Affine", "gain": 0.15}
+    for width in (0.0, 0.2):
+        study = study_of(plant=plant, disturbance={"hysteresis": width})
+        found = build(study, tmp_path / "study.toml")
+        assert found.assumed_hysteresis == width
+        assert len(_hysteresis_notes(found)) == (width > 0.0)
 
 
 @pytest.mark.parametrize(

@@ -321,6 +321,19 @@ def test_a_response_and_the_limits_give_the_range(gain):
     assert "is it in um" in doubts(replace(plan, noise=1.0), shown)[0]
 
 
+def test_the_hysteresis_of_a_stage_replaces_the_typical_one():
+    shown = Shown.by_response(mode_response(), 1e-4, LIMITS)
+    assert shown.hysteresis == 0.15
+    for width in (0.0, 0.03):
+        plan = planned_by(shown, LIMITS | {"hysteresis": width})
+        assert f"\nhysteresis = {width}\n" in first_study(plan, {"response": "r"}, 1e4)
+    for wrong in (-0.1, 0.5):
+        with pytest.raises(ValueError, match=f"hysteresis is {wrong:g}; the width of"):
+            planned_by(shown, LIMITS | {"hysteresis": wrong})
+    plan = planned_by(replace(shown, hysteresis=None), LIMITS)
+    assert "[disturbance]" not in first_study(plan, {"record": "r.csv"}, 1e4)
+
+
 def test_a_response_without_limits_is_refused():
     with pytest.raises(ValueError, match="not show these: give --lower and --noise"):
         Shown.by_response(mode_response(), 1e-4, {"upper": 3.0})
@@ -338,6 +351,7 @@ def test_the_study_of_a_response_fits_it(tmp_path):
     case = build(load(file), file)
     assert case.response is not None
     assert case.study.title == "inversion_sliding_mode on the stage of bench.csv"
+    assert case.study.disturbance.hysteresis == case.assumed_hysteresis == 0.15
     assert case.study.rate == 1e4
     assert "controller.controller.feedback.law.integral" in case.space.paths
 
@@ -663,7 +677,7 @@ def test_a_start_from_a_response_tunes_and_exports(run, response, tmp_path):
 
 
 def test_what_a_response_does_not_show_is_asked_first(run, response, tmp_path):
-    answers = "-20\n120\n0.002\n\n5\n"
+    answers = "-20\n120\n0.002\n\n\n5\n"
     options = "--response", "--rate", "10000"
     status, output, _ = run(*options, record=response, answers=answers + 9 * "\n")
     assert status == 0, output
@@ -697,6 +711,7 @@ def test_bad_options_of_a_response_are_refused(run, response, options, message):
     ("options", "message"),
     [
         (("--held",), "--held needs --response"),
+        (("--hysteresis", "0.1"), "--hysteresis needs --response"),
         (("--controller", "pid"), "'pid' is unknown; there are inversion_sliding_mode"),
         (("--frequency", "-1"), "frequency is -1 Hz; it must be above 0"),
         (("--lower", "9", "--upper", "3"), "lower is 9 V and upper 3 V; lower must"),

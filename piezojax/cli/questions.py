@@ -26,6 +26,9 @@ QUESTIONS = {
     "upper": Question("upper limit of the voltage [V]"),
     "slew_rate": Question("slew rate of the amplifier, 0 if unknown [V/s]"),
     "noise": Question("rms noise of the sensor [um]"),
+    "hysteresis": Question(
+        "width of the hysteresis loop that large motions have, relative to its height"
+    ),
     "frequency": Question("frequency of the slowest reference [Hz]"),
     "track": Question(
         "references to track, with their frequencies in Hz",
@@ -107,7 +110,9 @@ def option(name: str) -> str:
 
 
 def concerns(name: str, plan: "Plan") -> bool:
-    """Return whether a question matters for the controller of ``plan``."""
+    """Return whether a question matters for the measurement and controller."""
     from ..study.first_plan import DEVICES
 
+    if name == "hysteresis":
+        return plan.hysteresis is not None
     return name not in OF_DEVICES or plan.controller in DEVICES

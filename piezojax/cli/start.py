@@ -25,7 +25,7 @@ STUDY, TUNED, EXPORTED = "study.toml", "tuned", "controller"
 OF_RECORDS = "time", "input", "output", "rate", "resample"
 """Options of ``recognised_columns``."""
 
-OF_RESPONSES = "unit", "held"
+OF_RESPONSES = "unit", "held", "hysteresis"
 """Options that only ``--response`` takes."""
 
 INTERRUPTED = "interrupted"

@@ -31,7 +31,8 @@ class About(BaseModel):
     each axis. ``error_bound`` bounds the error of a fitted model, ``residual_rms`` is
     the rms error of each output on the validation part of its record, in the unit of
     the output, and ``checked`` lists the other records of its validation.
-    ``standard_errors`` are the standard errors of its parameters, by path. ``unsafe``
+    ``standard_errors`` are the standard errors of its parameters, by path.
+    ``small_motions`` tells that the model is fitted to small motions alone. ``unsafe``
     lists the alarms raised when the System was made; ``load`` refuses a file with any.
     Keys of later versions are ignored.
     """
@@ -54,6 +55,7 @@ class About(BaseModel):
     residual_rms: list[float] = []
     checked: list[str] = []
     standard_errors: dict[str, float] = {}
+    small_motions: bool = False
     unsafe: list[str] = []
 
     def origin(self, subject: str) -> list[str]:

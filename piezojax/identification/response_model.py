@@ -126,6 +126,7 @@ def identify_response(
             for path, one in parameters.items()
             if one.standard_error is not None and path != "gain.gain"
         },
+        small_motions=True,
     )
     return ResponseModel(system, report, response, fit, about)
 

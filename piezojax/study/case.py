@@ -22,6 +22,7 @@ from ..core.system import System, accepts
 from ..identification import Fit
 from ..identification.residual_record import ResidualRecord, load_residual
 from ..identification.response_model import ResponseModel
+from ..signals.missing_hysteresis import TYPICAL
 from .designs import design_of
 from .ensemble import Ensemble, Stage, ensemble_of
 from .fitted_plant import fitted_plant, on_axes, plant_of_response
@@ -86,6 +87,14 @@ class Case:
         """Residual of the plant, from the fit of this study or from its file, or
         None."""
         return self.saved_residual if self.fit is None else ResidualRecord.of(self.fit)
+
+    @property
+    def assumed_hysteresis(self) -> float:
+        """Relative width of the hysteresis loop that the plant lacks, 0 if none."""
+        given = self.study.disturbance.hysteresis
+        if given is None:
+            return TYPICAL if self.plant_about.small_motions else 0.0
+        return given
 
     @property
     def highest_reference(self) -> float | tuple[float, ...]:

@@ -9,6 +9,7 @@ from ..identification import Record
 from ..identification.records.recognise import noise_rms
 from ..identification.records.response import FrequencyResponse
 from ..signals import signal, time_grid
+from ..signals.missing_hysteresis import TYPICAL
 from ..signals.waveforms import parse
 from .designs import ALL_DESIGNS
 from .tables import one_of
@@ -69,8 +70,9 @@ class Shown:
 
     ``inputs`` (V) and ``outputs`` (um) are the lowest and highest values, ``dt`` is the
     sample time of the loop, s, ``noise`` the rms noise of the sensor, um, and ``slew``
-    the largest slew rate of the voltage, V/s. The last two are None if a measurement
-    does not show them.
+    the largest slew rate of the voltage, V/s. These two are None if a measurement does
+    not show them. ``hysteresis`` is the relative width of the loop that is to be
+    assumed, None if the measurement shows the loop.
     """
 
     inputs: tuple[float, float]
@@ -78,6 +80,7 @@ class Shown:
     dt: float
     noise: float | None = None
     slew: float | None = None
+    hysteresis: float | None = None
 
     @classmethod
     def by_record(cls, record: Record) -> "Shown":
@@ -107,7 +110,7 @@ class Shown:
         slowest = response.values[0]
         gain = float(np.copysign(np.abs(slowest), slowest.real))
         low, high = sorted((gain * lower, gain * upper))
-        return cls((lower, upper), (low, high), dt)
+        return cls((lower, upper), (low, high), dt, hysteresis=TYPICAL)
 
 
 UNSHOWN = "lower", "upper", "noise"
@@ -126,8 +129,10 @@ class Plan:
     design. For a device, ``scale`` is that of its gains (V/um; 0 if it is unknown and
     to be assumed), and its positions range from ``lowest`` to ``highest``.
     ``slew_rate`` is that of the amplifier, V/s; if it is 0, it is unknown, and the
-    voltage is to move at most at ``recorded_slew``, V/s, if that is not 0. Raises
-    ValueError for values that no stage can have, and for unknown references or designs.
+    voltage is to move at most at ``recorded_slew``, V/s, if that is not 0.
+    ``hysteresis`` is the relative width of the loop that the stage is assumed to have
+    beyond the plant, None to assume none. Raises ValueError for values that no stage
+    can have, and for unknown references or designs.
     """
 
     lower: float
@@ -144,6 +149,7 @@ class Plan:
     highest: float = 1.0
     slew_rate: float = 0.0
     recorded_slew: float = 0.0
+    hysteresis: float | None = None
 
     def __post_init__(self):
         one_of(self.controller, ALL_DESIGNS)
@@ -161,6 +167,11 @@ class Plan:
                 raise ValueError(
                     f"{name} is {getattr(self, name):g} {unit}; it must be at least 0"
                 )
+        if self.hysteresis is not None and not 0.0 <= self.hysteresis < 0.5:
+            raise ValueError(
+                f"hysteresis is {self.hysteresis:g}; the width of a loop is at least 0 "
+                "and below 0.5 times its height"
+            )
         for low, high, unit in (("lower", "upper", "V"), ("lowest", "highest", "um")):
             ends = getattr(self, low), getattr(self, high)
             if ends[0] >= ends[1]:
@@ -215,6 +226,7 @@ def planned(shown: Shown, given: dict[str, Any]) -> Plan:
             "lowest": _rounded(low),
             "highest": _rounded(high),
             "recorded_slew": _rounded(shown.slew or 0.0),
+            "hysteresis": shown.hysteresis,
         }
         return Plan(**(suggested | known))
 

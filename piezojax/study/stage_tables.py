@@ -20,6 +20,7 @@ from .tables import (
 
 Bandwidth = Annotated[float, Field(ge=1e-3, le=1e9, allow_inf_nan=False, strict=True)]
 Order = Annotated[int, Field(strict=True, ge=1, le=4)]
+LoopWidth = Annotated[float, Field(ge=0, lt=0.5, allow_inf_nan=False, strict=True)]
 
 SIGNAL = "V, um or urad"
 """Unit of the signal behind the electronics."""
@@ -138,6 +139,11 @@ class DisturbanceTable(Table):
     drift_rms: Annotated[ByAxis[NotNegative], in_unit("um or urad")] = 0.0
     """Rms value, after one second, of a random walk that is added to the
     displacement."""
+    hysteresis: LoopWidth | None = None
+    """Width of the hysteresis loop that the plant lacks, over the span of all
+    references and relative to its height. Its deviation from the plant is a
+    disturbance. Without this key it is 0.15, which is typical of piezo ceramics, for a
+    plant from a frequency response, and 0 for others."""
     output: NoiseFile | None = None
     """Measured vibration, added to the displacement; in um or urad, or a unit that is
     converted to it."""

@@ -16,7 +16,7 @@ from ..core.system import System
 from ..study import Case, Study
 from ..study.parameters import check_value
 from ..study.sweep_table import SweepTable, SweptTable
-from ..tuning.unexplained import STRETCHES
+from ..tuning.unexplained import STRETCHES, leaves_unexplained
 
 ACCELERATED_BLOCK = 131072
 """Number of points of a block on an accelerator: enough to occupy it."""
@@ -146,7 +146,7 @@ def runs_of_point(case: Case) -> int:
     """Return the number of simulations for each point."""
     study = case.study
     plants = len(sweep_table(study).plants) or 1
-    stretches = 1 if case.residual is None else STRETCHES
+    stretches = STRETCHES if leaves_unexplained(case) else 1
     return plants * len(references_of(study)) * study.holdout_draws * stretches
 
 

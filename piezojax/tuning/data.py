@@ -18,7 +18,13 @@ from ..study import Case, Stage
 from ..study.measured_noise import MeasuredNoise
 from .runs import Signals
 from .traces import Trace, traces_of
-from .unexplained import STRETCHES, Suppression, residual_disturbances, suppression_of
+from .unexplained import (
+    STRETCHES,
+    Suppression,
+    leaves_unexplained,
+    suppression_of,
+    unexplained_disturbances,
+)
 
 _STREAMS: dict[Part, int] = {"train": 0, "validate": 1}
 """Random streams of one seed: the hold-out has other draws than tuning."""
@@ -45,8 +51,8 @@ class Data:
 def make_data(case: Case) -> Data:
     """Return the signals of ``case``, the tuning references before the unseen ones.
 
-    The noise of the hold-out comes from a random stream of its own. With a residual
-    both parts have ``STRETCHES`` times as many draws.
+    The noise of the hold-out comes from a random stream of its own. If the plant leaves
+    something unexplained, both parts have ``STRETCHES`` times as many draws.
     """
     study = case.study
     (holding,) = holding_inputs(own_stage(case.loop), case.references[:, 0])
@@ -102,18 +108,14 @@ def _signals(
     drawn = {"train": study.objective.noise_draws, "validate": study.holdout_draws}
     draws = drawn[part]
     count, samples, *axes = references.shape
-    if case.residual is not None:
+    unexplained = leaves_unexplained(case)
+    if unexplained:
         draws *= STRETCHES
     shape = (count, draws, samples, *axes)
     noise = _noise(case, random, shape, part)
     disturbance = None
-    if case.residual is not None:
-        played = [
-            residual_disturbances(
-                case.residual, reference, np.asarray(time_s), part, loop
-            )
-            for reference in references
-        ]
+    if unexplained:
+        played = unexplained_disturbances(case, np.asarray(time_s), part, loop)
         disturbance = as_array(np.repeat(played, draws // STRETCHES, axis=1))
     drift = np.array(case.study.by_axis(case.study.disturbance.drift_rms))
     if drift.any():

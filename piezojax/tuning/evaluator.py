@@ -31,6 +31,7 @@ from .data import held, own_stage
 from .level_stages import level_stages
 from .objective import MARGIN_BLOCK, StepTest, margins_on
 from .runs import Signals, evaluate
+from .steep_stage import steep_stage
 
 EVERY = 65
 """Number of plants up to which a search computes the margins of all at every point: the
@@ -249,12 +250,15 @@ def _count(stages: Stage | None) -> int:
 def drawn_stages(case: Case, part: Part) -> Stage | None:
     """Return the nominal stage and the drawn stages of ``part``, stacked.
 
-    For "margins" the stages at each level of a scheduled plant follow. None if there is
-    no other stage than the nominal one.
+    For "margins" the stages at each level of a scheduled plant follow, and that with
+    the largest gain of an assumed hysteresis. None if there is no other stage than the
+    nominal one.
     """
     drawn = case.ensemble.stages(part) if case.ensemble else None
-    levels = level_stages(case.loop) if part == "margins" else None
-    others = [stages for stages in (drawn, levels) if stages is not None]
+    others = [drawn]
+    if part == "margins":
+        others += [level_stages(case.loop), steep_stage(case)]
+    others = [stages for stages in others if stages is not None]
     if not others:
         return None
     return jax.tree.map(

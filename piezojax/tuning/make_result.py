@@ -28,6 +28,7 @@ from .result import (
     Scores,
     scores,
 )
+from .steep_stage import steep_stage
 
 
 def make_result(
@@ -184,6 +185,7 @@ def _warnings(
     case: Case, bounds_reached: Mapping[str, str], after: Scores, holdout: Scores
 ) -> list[str]:
     found = []
+    found += _hysteresis_notes(case)
     found += _residual_notes(case)
     if case.fit is not None:
         report = case.fit.report
@@ -208,6 +210,26 @@ def _warnings(
                 f"the actuator saturates on {where} runs of {', '.join(railed)}"
             )
     return found
+
+
+def _hysteresis_notes(case: Case) -> list[str]:
+    """Return a note on the hysteresis that is assumed, or not, beyond the plant."""
+    width = case.assumed_hysteresis
+    if width > 0.0:
+        kept = "also hold" if steep_stage(case) else "are not checked"
+        return [
+            "the stage is assumed to have hysteresis that the plant lacks, a loop "
+            f"whose width is {100.0 * width:.3g} % of its height over the references "
+            "(disturbance.hysteresis): its deviation from the plant disturbs half of "
+            "the runs, and the errors hold for stages with no wider loop; limits on "
+            f"margins {kept} at its largest gain"
+        ]
+    if case.plant_about.small_motions:
+        return [
+            "disturbance.hysteresis is 0, and the plant shows only small motions: the "
+            "errors hold for a stage without hysteresis"
+        ]
+    return []
 
 
 def _residual_notes(case: Case) -> list[str]:

@@ -1,4 +1,5 @@
-"""Residual of a fitted plant as disturbances of the loop."""
+"""What a plant leaves unexplained, as disturbances of the loop: the residual of its
+record, and an assumed hysteresis."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -12,9 +13,12 @@ from ..analysis.stability.small_motion import sensitivity_impulse
 from ..core.arrays import Scalar, as_array
 from ..core.feedback import Feedback
 from ..identification.residual_record import Part, ResidualRecord, Stretch
+from ..signals.missing_hysteresis import missing_hysteresis
+from ..study import Case
 
 STRETCHES = 2
-"""Number of stretches of the residual that disturb each reference."""
+"""Number of disturbances for each reference: stretches of the residual, or the assumed
+hysteresis and none."""
 
 OVERLAP, LEAST, MOST = 4, 12, 64
 """Starting points in the residual that are tried per length of the reference; fewest
@@ -42,6 +46,31 @@ class Suppression(NamedTuple):
 
         error = fftconvolve(disturbance, self.response)[: disturbance.size]
         return float(np.sqrt(np.mean(error[self.first :] ** 2)))
+
+
+def leaves_unexplained(case: Case) -> bool:
+    """Return whether the plant of ``case`` has a residual or lacks a hysteresis."""
+    return case.residual is not None or case.assumed_hysteresis > 0.0
+
+
+def unexplained_disturbances(
+    case: Case, time_s: Samples, part: Part, loop: Suppression | None = None
+) -> Float[np.ndarray, "references stretches samples *axes"]:
+    """Return what the plant of ``case`` leaves unexplained under each reference.
+
+    That is the sum of ``residual_disturbances`` and ``missing_hysteresis``. The latter
+    disturbs only the first stretch: gains that rely on a hysteresis would be poor on a
+    stage with less.
+    """
+    total = np.zeros((len(case.references), STRETCHES, *case.references.shape[1:]))
+    if case.assumed_hysteresis > 0.0:
+        total[:, 0] = missing_hysteresis(case.references, case.assumed_hysteresis)
+    if case.residual is not None:
+        total += [
+            residual_disturbances(case.residual, reference, time_s, part, loop)
+            for reference in case.references
+        ]
+    return total
 
 
 def residual_disturbances(

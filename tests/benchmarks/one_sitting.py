@@ -1,6 +1,7 @@
 """Test of ``piezojax.start --yes`` on stages that share no code with piezojax.
 
     python tests/benchmarks/one_sitting.py [--stages 0:40:2] [--device NAME] [--excite]
+    python tests/benchmarks/one_sitting.py --response [--stages 0:40:2]
 
 The record of each stage of tests/oracles is written in one of four dialects of files.
 ``start`` gets that file and ``--yes``, nothing else. The voltages are those of the
@@ -8,16 +9,20 @@ oracles, or with ``--excite`` those of ``piezojax.excite``. Its gains then run o
 stage as in promise.py, whose figures and bar the table has; the bar on the ratio is
 1.5, on 18 of 20 stages. Each start has 300 s. With ``--device nv200`` or ``e727`` the
 values of that device are tuned, with a scale of 9.3 V/um, on the stages whose record
-has its rate.
+has its rate. With ``--response``, ``start`` gets the frequency response of each stage
+instead, measured with small motions around the middle of the voltages, and the limits
+and noise of the stage. The zero of its sensor is then at 0 V.
 """
 
 import argparse
+import dataclasses
 import json
 import subprocess
 import sys
 import tempfile
 import time
 import tomllib
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -82,12 +87,35 @@ def excited(stage):
     return voltages, np.concatenate([[first], stage.respond(voltages[:-1])[0]])
 
 
-def started(stage, dialect, folder, record_of, options):
-    """Return the exit status of a start, its output, and the seconds."""
+def response(stage, folder):
+    """Write the response of ``stage`` to a multisine; return its file."""
+    frequency, values = excitation.small_response(stage)
+    path, decibel = folder / "bench.csv", 20.0 * np.log10(np.abs(values))
+    columns = np.c_[frequency, decibel, np.degrees(np.unwrap(np.angle(values)))]
+    header = "frequency_Hz,magnitude_dB,phase_deg"
+    np.savetxt(path, columns, "%.9g", ",", header=header, comments="")
+    return path
+
+
+def responded(stage, folder):
+    """Return the file of the response of ``stage``, and what it does not show."""
+    p = stage.parameters
+    known = {"lower": p.lower, "upper": p.upper, "noise": p.noise, "rate": p.rate}
+    shown = [f"--{name}={value}" for name, value in known.items()]
+    return response(stage, folder), ["--response", "--held", *shown]
+
+
+def recorded(stage, folder, dialect, record_of):
+    """Return the file of a record of ``stage``, in a dialect, and no options."""
     voltages, readings = record_of(stage)
     columns = np.c_[stage.dt * np.arange(len(voltages)), voltages, readings]
-    record, begun = dialect(columns, folder), time.perf_counter()
-    command = [sys.executable, "-m", "piezojax.start", record, "--yes", *options]
+    return dialect(columns, folder), []
+
+
+def started(measured, folder, options):
+    """Return the exit status of a start, its output, and the seconds."""
+    (file, own), begun = measured, time.perf_counter()
+    command = [sys.executable, "-m", "piezojax.start", file, "--yes", *own, *options]
     done = subprocess.run(
         [*command, "--out", folder / "out"], capture_output=True, text=True, check=False
     )
@@ -95,14 +123,18 @@ def started(stage, dialect, folder, record_of, options):
     return done.returncode, done.stdout + done.stderr, seconds
 
 
-def line_of(number, dialect, record_of, options=()):
-    """Return the line of a stage: exit status, figures and alarms."""
-    stage = forty_stages.stage(number)
-    line = {"name": stage.parameters.name, "dialect": dialect.__name__}
+def line_of(stage, measure, options=()):
+    """Return the line of a stage: exit status, figures and alarms.
+
+    ``measure(stage, folder)`` writes a file of it and returns its path and options.
+    """
+    line = {"name": stage.parameters.name}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        status, output, seconds = started(stage, dialect, folder, record_of, options)
-        line |= {"status": status, "wall_s": seconds, "alarms": []}
+        measured = measure(stage, folder)
+        status, output, seconds = started(measured, folder, options)
+        file = measured[0].suffix[1:]
+        line |= {"file": file, "status": status, "wall_s": seconds, "alarms": []}
         if status not in (0, 3):
             return line | {"refused": output.splitlines()[-1]}
         tuned = folder / "out" / "tuned"
@@ -151,7 +183,7 @@ def table_of(lines):
         known = "refused" not in line
         table.add_row(
             line["name"],
-            line["dialect"],
+            line["file"],
             *(f"{1e3 * line[key]:.4g}" if known else "" for key in _ERRORS),
             f"{line['ratio']:.3g}" if known else "",
             f"{line['wall_s']:.0f}",
@@ -179,6 +211,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--stages", default="0:40:2", metavar="FIRST:STOP:STEP")
     parser.add_argument("--excite", action="store_true", help="piezojax.excite records")
+    parser.add_argument("--response", action="store_true", help="frequency responses")
     parser.add_argument("--device", choices=DEVICE_DESIGNS)
     parser.add_argument("--json", type=Path)
     chosen = parser.parse_args()
@@ -190,12 +223,17 @@ def main():
         options = ["--controller", chosen.device, "--scale", "9.3"]
         numbers = [n for n in numbers if has_device_rate(n)]
     for number in numbers:
+        stage = forty_stages.stage(number)
         dialect = DIALECTS[number // 2 % len(DIALECTS)]
-        line = line_of(number, dialect, record_of, options)
+        measure = partial(recorded, dialect=dialect, record_of=record_of)
+        if chosen.response:
+            parameters = dataclasses.replace(stage.parameters, zero=0.0)
+            stage, measure = forty_stages.Stage(parameters, 0), responded
+        line = line_of(stage, measure, options)
         lines.append(line)
         ratio = f", {line['ratio']:.2f}" if "ratio" in line else ""
         console.print(
-            f"{number}: {line['name']} ({line['dialect']}): {word_of(line)}{ratio}, "
+            f"{number}: {line['name']} ({line['file']}): {word_of(line)}{ratio}, "
             f"{line['wall_s']:.0f} s, exit status {line['status']}",
             soft_wrap=True,
         )

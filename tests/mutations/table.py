@@ -362,5 +362,35 @@ MUTATIONS = (
         'material["c"]',
         (_ROBUST, "-k", "deviation"),
     ),
+    # Hysteresis that a plant lacks
+    Mutation(
+        "plays with the radius as their diameter",
+        "signals/missing_hysteresis.py",
+        "places[:, k] - radii, places[:, k] + radii",
+        "places[:, k] - 0.5 * radii, places[:, k] + 0.5 * radii",
+        ("tests/test_missing_hysteresis.py",),
+    ),
+    Mutation(
+        "a hysteresis that disturbs every run",
+        "tuning/unexplained.py",
+        "total[:, 0] = missing",
+        "total[:] = missing",
+        (_DATA, "-k", "assumed"),
+    ),
+    Mutation(
+        "margins without the largest gain",
+        "tuning/evaluator.py",
+        "others += [level_stages(case.loop), steep_stage(case)]",
+        "others += [level_stages(case.loop)]",
+        ("tests/tuning/test_steep_stage.py",),
+    ),
+    # Two searches
+    Mutation(
+        "a second search without the end of the first",
+        "tuning/limited_search.py",
+        "return min(search, other, key=lambda state: state.rank)",
+        "return search",
+        ("tests/tuning/test_safe_by_default.py",),
+    ),
 )
 """All mutations; see ``run.py``."""

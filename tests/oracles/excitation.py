@@ -123,3 +123,28 @@ def record(stage, kind="careful", seed=0):
     voltages = KINDS[kind](stage.parameters, np.random.default_rng([40, seed]))
     first = stage.reset(voltages[0], seed)
     return voltages, np.concatenate([[first], stage.respond(voltages[:-1])[0]])
+
+
+def small_response(stage, share=0.02, periods=12, lines=100, length=1 << 14):
+    """Return frequencies (Hz) and the response (um/V) of ``stage`` to small motions.
+
+    A multisine of random phase moves around the middle voltage, where the stage has
+    rested for some time, with ``share`` of the span as its amplitude. Two periods are
+    left out.
+    """
+    p, random = stage.parameters, np.random.default_rng(1)
+    places = np.geomspace(4.0, 0.45 * length, lines).round().astype(int)
+    places = np.unique(places)
+    spectrum = np.zeros(length // 2 + 1, complex)
+    spectrum[places] = np.exp(2j * np.pi * random.random(places.size))
+    signal = np.fft.irfft(spectrum, length)
+    signal *= share * p.span / np.abs(signal).max()
+    middle = 0.5 * (p.lower + p.upper)
+    rest = np.concatenate([np.linspace(0.0, middle, 4000), np.full(8000, middle)])
+    stage.reset(0.0)
+    voltages = np.concatenate([rest, middle + np.tile(signal, periods)])
+    # A reading shows the voltage of the sample before.
+    readings = np.roll(stage.respond(voltages)[0], 1)[rest.size :]
+    mean = readings.reshape(periods, length)[2:].mean(axis=0)
+    values = np.fft.rfft(mean)[places] / np.fft.rfft(signal)[places]
+    return places * p.rate / length, values

@@ -10,6 +10,7 @@ from stand_ins import fit_of
 from piezojax.core.paths import replace
 from piezojax.identification.records.record import Record
 from piezojax.identification.residual_record import ResidualRecord
+from piezojax.signals.missing_hysteresis import missing_hysteresis
 from piezojax.solve.clock import Clock
 from piezojax.study import Study, build
 from piezojax.tuning import unexplained
@@ -84,9 +85,9 @@ def test_noise_is_of_unit_variance():
 # Residual of a fitted plant
 
 
-def fitted(residual):
+def fitted(residual, **tables):
     """Return the data of a case fitted to a record of 0, 1, 0, 1, ... um."""
-    case = case_of()
+    case = case_of(**tables)
     output = np.arange(400.0) % 2.0
     record = Record(output, output, case.study.dt)
     fit = fit_of(case.loop.plant, record, output - residual)
@@ -99,6 +100,24 @@ def test_training_and_validation_parts_disturb_different_runs():
     data = fitted(residual)
     np.testing.assert_allclose(data.tuning.disturbance, np.full((2, 2, 400), 1.0))
     np.testing.assert_allclose(data.holdout.disturbance, np.full((3, 2, 400), -2.0))
+
+
+def test_an_assumed_hysteresis_disturbs_all_runs():
+    assumed = {"disturbance": {"hysteresis": 0.1}}
+    case = case_of(**assumed, objective={"noise_draws": 3})
+    data, expected = make_data(case), missing_hysteresis(case.references, 0.1)
+    assert np.ptp(expected[0]) > 0.1
+    assert data.tuning.noise.shape == (2, 6, 400)
+    for signals in (data.tuning, data.holdout):
+        for disturbance, deviations in zip(signals.disturbance, expected, strict=False):
+            draws = len(disturbance) // 2
+            np.testing.assert_array_equal(disturbance[:draws], [deviations] * draws)
+            np.testing.assert_array_equal(disturbance[draws:], 0.0)
+    # beside a residual
+    data = fitted(np.repeat([9.0, 1.0, -2.0], [1, 199, 200]), **assumed)
+    both = np.stack([expected, np.zeros_like(expected)], axis=1)
+    np.testing.assert_allclose(data.tuning.disturbance, 1.0 + both[:2])
+    np.testing.assert_allclose(data.holdout.disturbance, -2.0 + both)
 
 
 REST, SLOW = np.zeros(400), 1e-9 * np.arange(400.0)
