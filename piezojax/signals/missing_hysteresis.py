@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-TYPICAL = 0.15
+TYPICAL_WIDTH = 0.15
 """Width of the loop of piezo ceramics under large voltages, relative to its height.
 
 Source: PI Ceramic, Fundamentals of Piezo Technology, displacement behaviour: 10 to 15 %

@@ -22,7 +22,7 @@ from ..core.system import System, accepts
 from ..identification import Fit
 from ..identification.residual_record import ResidualRecord, load_residual
 from ..identification.response_model import ResponseModel
-from ..signals.missing_hysteresis import TYPICAL
+from ..signals.missing_hysteresis import TYPICAL_WIDTH
 from .designs import design_of
 from .ensemble import Ensemble, Stage, ensemble_of
 from .fitted_plant import fitted_plant, on_axes, plant_of_response
@@ -93,7 +93,7 @@ class Case:
         """Relative width of the hysteresis loop that the plant lacks, 0 if none."""
         given = self.study.disturbance.hysteresis
         if given is None:
-            return TYPICAL if self.plant_about.small_motions else 0.0
+            return TYPICAL_WIDTH if self.plant_about.small_motions else 0.0
         return given
 
     @property

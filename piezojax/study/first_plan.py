@@ -9,7 +9,7 @@ from ..identification import Record
 from ..identification.records.recognise import noise_rms
 from ..identification.records.response import FrequencyResponse
 from ..signals import signal, time_grid
-from ..signals.missing_hysteresis import TYPICAL
+from ..signals.missing_hysteresis import TYPICAL_WIDTH
 from ..signals.waveforms import parse
 from .designs import ALL_DESIGNS
 from .tables import one_of
@@ -110,7 +110,7 @@ class Shown:
         slowest = response.values[0]
         gain = float(np.copysign(np.abs(slowest), slowest.real))
         low, high = sorted((gain * lower, gain * upper))
-        return cls((lower, upper), (low, high), dt, hysteresis=TYPICAL)
+        return cls((lower, upper), (low, high), dt, hysteresis=TYPICAL_WIDTH)
 
 
 UNSHOWN = "lower", "upper", "noise"

@@ -69,7 +69,7 @@ def search_within_limits(
     every = every.on_margin_stages(carried.stages)
     again, strategy = search_box(every, case, progress)
     again.evaluations += search.evaluations
-    again = _or_from(search.unit, every, case, again, strategy, progress)
+    again = _or_from(search, every, case, again, strategy, progress)
     return _repeated(every, case, evaluator, carried, again, strategy, progress)
 
 
@@ -110,14 +110,14 @@ def _alarming_peak(case: Case, stability: StabilityReports) -> float:
 
 
 def _or_from(
-    unit: np.ndarray,
+    begin: SearchState,
     objective: Objective,
     case: Case,
     search: SearchState,
     strategy: Strategy | None,
     progress: Progress,
 ) -> SearchState:
-    """Return ``search``, or a descent from ``unit`` alone if it ends better.
+    """Return ``search``, or a descent from the end of ``begin`` if it ends better.
 
     Among the starts of the search, a cut would drop a point that violates the limits.
     """
@@ -125,7 +125,7 @@ def _or_from(
         return search
     progress.stage("searching from the gains without the limits")
     try:
-        other = _descent(unit, objective, case, strategy, progress)
+        other = _descent(begin, objective, case, strategy, progress)
     except KeyboardInterrupt:
         search.status = "interrupted"
         return search
@@ -135,14 +135,15 @@ def _or_from(
 
 
 def _descent(
-    unit: np.ndarray,
+    begin: SearchState,
     objective: Objective,
     case: Case,
     strategy: Strategy,
     progress: Progress,
 ) -> SearchState:
-    """Return the search from one start."""
-    search = SearchState(unit, starts=unit[None])
+    """Return the search from the end of ``begin`` alone, with its warnings."""
+    unit = begin.unit
+    search = SearchState(unit, starts=unit[None], warnings=begin.warnings)
     steps = case.study.optimiser.steps
     minimise(strategy, objective, search.starts, search, steps, progress)
     return search
@@ -183,7 +184,7 @@ def _repeated(
                 objective = objective.on_margin_stages(carried.stages)
             elif not peak:
                 break
-            again = _descent(search.unit, objective, case, strategy, progress)
+            again = _descent(search, objective, case, strategy, progress)
             again.evaluations += search.evaluations
             search, stability = again, exact_stability(case, again)
     except KeyboardInterrupt:

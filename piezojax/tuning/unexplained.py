@@ -1,5 +1,4 @@
-"""What a plant leaves unexplained, as disturbances of the loop: the residual of its
-record, and an assumed hysteresis."""
+"""What a plant leaves unexplained, as disturbances of the loop."""
 
 from collections.abc import Iterator
 from typing import NamedTuple

@@ -73,9 +73,13 @@ def repeated(monkeypatch, peaks, plants=(), status="converged", strategy="a stra
     evaluator = SimpleNamespace(
         worst_plants=lambda loop, before: Carried(*next(found, (0.0, None)), before)
     )
-    search = SearchState(np.array([0.5]), status=status, evaluations=5)
-    repeat = inspect.unwrap(limited_search._repeated)  # with replaced arguments
-    return searched, repeat(
+    search = SearchState(
+        np.array([0.5]), status=status, evaluations=5, warnings=["the start diverges"]
+    )
+    for name in ("_descent", "_repeated"):  # with replaced arguments
+        unchecked = inspect.unwrap(getattr(limited_search, name))
+        monkeypatch.setattr(limited_search, name, unchecked)
+    return searched, limited_search._repeated(
         Limited({}), case, evaluator, None, search, strategy, Silent()
     )
 
@@ -86,6 +90,7 @@ def test_the_limit_is_tightened_until_the_exact_one_is_kept(monkeypatch):
     assert [aim for aim, _ in searched] == pytest.approx([1.5, 1.0 + 0.5 / 1.2])
     _, search, _, stability = found
     assert search.evaluations == 25
+    assert search.warnings == ["the start diverges"]
     assert stability == 0.0
 
 
