@@ -12,7 +12,7 @@ from ..core.system import Affine, Delay, System, series
 from ..dynamics import FractionalDelay, Modes
 from .estimators.estimate import FittedParameter
 from .estimators.modal_fit import MOST_MODES, modal_fit
-from .estimators.modal_model import ModalFit, error_bound
+from .estimators.modal_model import FOLDED, ModalFit, error_bound
 from .measured_response import Measurement
 from .records.response import FrequencyResponse
 
@@ -27,9 +27,6 @@ number of samples."""
 
 CERTAIN = 2.0
 """Standard errors above which a delay counts as found."""
-
-FOLDED = 0.9
-"""Share of half the rate above which a measured mode cannot be simulated."""
 
 LARGE = 2.0
 """Ratio of the residual's mean square to the variance above which a note reports it."""

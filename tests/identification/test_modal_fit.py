@@ -317,3 +317,29 @@ def test_known_variances_are_the_weights():
     assert "times as large as the variance of the response" in found.report.notes[1]
     ratio = found.fit.deviation / np.sqrt(0.5 * variance)
     assert np.median(ratio) == pytest.approx(1.0, abs=0.15)
+
+
+def test_a_floor_below_the_noise_in_proportion_is_found():
+    """Few lines on a mode whose response falls far below the noise of its sensor."""
+    frequency = np.geomspace(2.0, 4000.0, 100)
+    s = frequency / 300.0
+    gain = 0.2 / (1.0 - s**2 + 0.06j * s) / (1.0 + 2.0j * s)
+    relative, floor = 0.01, 2e-4
+    random = np.random.default_rng(7)
+    noise = random.standard_normal((2, 100)) * np.sqrt(0.5)
+    expected = np.hypot(relative * np.abs(gain), floor)
+    values = gain + expected * (noise[0] + 1j * noise[1])
+    found = noise_deviation(FrequencyResponse(frequency, values))
+    for part in (frequency < 100.0, frequency > 1500.0):
+        ratio = np.median(found[part] / expected[part])
+        assert ratio == pytest.approx(1.0, rel=0.4)
+
+
+def test_converters_show_no_mode_above_the_folding_frequency():
+    """Such a mode could not be simulated, and its image looks the same."""
+    frequency, sample = np.geomspace(2.0, 4500.0, 60), 1e-4
+    values = 0.1 / (1.0 + 2e-3j * np.pi * frequency)
+    for held, highest in ((sample, 0.9 * 0.5 / sample), (None, 1.2 * 4500.0)):
+        data = modal_model.lines_of(frequency, values, np.abs(values), held)
+        _, upper = modal_model.bounds(modal_model.Shape(1, False, False), data)
+        assert np.exp(upper[0]) == pytest.approx(2.0 * np.pi * highest)

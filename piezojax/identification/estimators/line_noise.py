@@ -70,10 +70,18 @@ def _scatter(frequency: np.ndarray, values: np.ndarray):
 def _level(power: np.ndarray, gain: np.ndarray, most: float):
     """Return the function a + b gain, with a, b >= 0, that fits ``power``.
 
-    Values above ``most`` times the fit are left out.
+    Values above ``most`` times the fit are left out. The search for them begins with
+    the medians of the quarter with the smallest gain, for a, and of the half with the
+    largest, for b.
     """
     columns = np.stack([np.ones(gain.size), gain], axis=1)
-    parts = np.array([0.0, float(np.median(power / np.maximum(gain, 1e-300)))])
+    small, middle = np.quantile(gain, [0.25, 0.5])
+    parts = np.array(
+        [
+            np.median(power[gain <= small]),
+            np.median((power / np.maximum(gain, 1e-300))[gain >= middle]),
+        ]
+    )
     for _ in range(10):
         expected = np.maximum(columns @ parts, 1e-300)
         near = power < most * expected

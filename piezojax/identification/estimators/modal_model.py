@@ -20,6 +20,9 @@ from .line_noise import MOST_LINES
 LEAST_DAMPING, MOST_DAMPING = 1e-4, 0.7
 """Bounds of the damping ratio of a mode."""
 
+FOLDED = 0.9
+"""Share of half the rate above which a mode cannot be simulated."""
+
 BEYOND = 1.2
 """Factor by which the frequency of a mode may lie outside the measured band."""
 
@@ -62,7 +65,8 @@ class Lines(NamedTuple):
 
     ``images`` [images, lines] are the angular frequencies that add up in a line, the
     first its own, and ``hold`` [images, lines] the response of the hold there.
-    ``least`` is the least variance of weighted residuals that counts.
+    ``least`` is the least variance of weighted residuals that counts, ``folding`` half
+    the rate of converters that hold the input (rad/s), infinite without them.
     """
 
     omega: np.ndarray
@@ -71,6 +75,7 @@ class Lines(NamedTuple):
     images: np.ndarray
     hold: np.ndarray
     least: float
+    folding: float = math.inf
 
     @property
     def highest(self) -> float:
@@ -101,7 +106,7 @@ def lines_of(
     images = omega + (2.0 * np.pi / held) * number[:, None]
     turn = 0.5 * images * held
     hold = np.sinc(turn / np.pi) * np.exp(-1j * turn)
-    return Lines(omega, values, deviation, images, hold, least)
+    return Lines(omega, values, deviation, images, hold, least, math.pi / held)
 
 
 def chosen_lines(data: Lines, chosen: np.ndarray | slice) -> Lines:
@@ -199,8 +204,9 @@ def stacked(values: np.ndarray) -> np.ndarray:
 def bounds(shape: Shape, data: Lines) -> tuple[np.ndarray, np.ndarray]:
     """Return the least and the greatest value of each unknown."""
     low, high = data.omega[0], data.highest
+    most = min(high * BEYOND, FOLDED * data.folding)
     size = 100.0 * float(np.max(np.abs(data.values)))
-    pairs = [(math.log(low / BEYOND), math.log(high * BEYOND))] * shape.modes
+    pairs = [(math.log(low / BEYOND), math.log(most))] * shape.modes
     pairs += [(math.log(LEAST_DAMPING), math.log(MOST_DAMPING))] * shape.modes
     pairs += [(-size, size)] * shape.modes
     pairs += [(math.log(0.03 / high), math.log(30.0 / low))] * shape.lag
