@@ -110,9 +110,8 @@ def option(name: str) -> str:
 
 
 def concerns(name: str, plan: "Plan") -> bool:
-    """Return whether a question matters for the measurement and controller."""
+    """Return whether ``plan`` has an answer that matters for its controller."""
     from ..study.first_plan import DEVICES
 
-    if name == "hysteresis":
-        return plan.hysteresis is not None
-    return name not in OF_DEVICES or plan.controller in DEVICES
+    known = getattr(plan, name) is not None
+    return known and (name not in OF_DEVICES or plan.controller in DEVICES)

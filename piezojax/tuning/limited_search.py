@@ -142,8 +142,7 @@ def _descent(
     progress: Progress,
 ) -> SearchState:
     """Return the search from the end of ``begin`` alone, with its warnings."""
-    unit = begin.unit
-    search = SearchState(unit, starts=unit[None], warnings=begin.warnings)
+    search = SearchState(begin.unit, starts=begin.unit[None], warnings=begin.warnings)
     steps = case.study.optimiser.steps
     minimise(strategy, objective, search.starts, search, steps, progress)
     return search

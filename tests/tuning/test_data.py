@@ -102,7 +102,7 @@ def test_training_and_validation_parts_disturb_different_runs():
     np.testing.assert_allclose(data.holdout.disturbance, np.full((3, 2, 400), -2.0))
 
 
-def test_an_assumed_hysteresis_disturbs_all_runs():
+def test_an_assumed_hysteresis_disturbs_half_of_the_runs():
     assumed = {"disturbance": {"hysteresis": 0.1}}
     case = case_of(**assumed, objective={"noise_draws": 3})
     data, expected = make_data(case), missing_hysteresis(case.references, 0.1)
