@@ -14,7 +14,7 @@ from ..core.system import Affine, Series, System, series
 from ..hysteresis.model import Hysteresis
 from .estimators.resonances import LinearDynamics, linear_dynamics
 from .estimators.slew_rate import few_steps, has_steps
-from .estimators.structure import Structure
+from .estimators.structure import Structure, distinct
 from .held_dynamics import HeldDynamics
 from .records.record import Record
 
@@ -272,7 +272,7 @@ def structure(
 
 
 def _starts(system: Series, space: Space, parts: Mapping[str, Recipe]) -> np.ndarray:
-    """Return all combinations of the parts' alternatives, as points of the unit box."""
+    """Return the combinations of the parts' alternatives, as points of the unit box."""
     choices = [
         [
             {f"{place}.{path}": value for path, value in one.items()}
@@ -285,7 +285,7 @@ def _starts(system: Series, space: Space, parts: Mapping[str, Recipe]) -> np.nda
         changes = {path: value for one in combination for path, value in one.items()}
         changed = replace(system, changes)
         found.append(point_of(changed, space))
-    return np.stack(found)
+    return distinct(np.stack(found))
 
 
 def point_of(system: System, space: Space) -> np.ndarray:

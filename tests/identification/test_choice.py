@@ -37,6 +37,14 @@ def made_by_coleman_hodgdon():
     return Record(ONE_TONE, clean + noise, DT, source="made up"), plant, clean
 
 
+@pytest.mark.parametrize(("first", "count"), [(0.0, 1), (27.0, 2)])
+def test_each_start_of_a_fit_is_another(first, count):
+    # A descent from a second start at the lowest voltage would be the first again.
+    voltage = np.append(first, ONE_TONE)
+    shape = structure("prandtl_ishlinskii", Record(voltage, 0.12 * voltage, DT))
+    assert len(shape.starts) == len(np.unique(shape.starts, axis=0)) == count
+
+
 def check_recovered(found, plant, clean):
     """Check parameters within 4 standard errors, and the output within the noise."""
     for path, parameter in found.report.parameters.items():

@@ -20,6 +20,11 @@ class Prior(NamedTuple):
     weights: np.ndarray
 
 
+def distinct(starts: np.ndarray) -> np.ndarray:
+    """Return the different ones of ``starts`` [starts, n], in their order."""
+    return starts[np.sort(np.unique(starts, axis=0, return_index=True)[1])]
+
+
 class Structure(NamedTuple):
     """A model to fit: its System, the box of its parameters, starts in the box.
 
@@ -63,8 +68,7 @@ class Structure(NamedTuple):
         columns = [path in kept for path in ranges]
         prior = self.prior and Prior(*(each[columns] for each in self.prior))
         # Starts that differed only in the fixed parameters are one.
-        starts = self.starts[:, columns]
-        starts = starts[np.sort(np.unique(starts, axis=0, return_index=True)[1])]
+        starts = distinct(self.starts[:, columns])
         guess = None if self.guess is None else self.guess[columns]
         return self._replace(
             space=space_of(kept), starts=starts, prior=prior, guess=guess
