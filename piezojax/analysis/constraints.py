@@ -67,7 +67,8 @@ class Constraint(NamedTuple):
     first axis, from the field ``source`` of the LoopFigures and dt in s. A limit must
     lie above ``above`` and below ``below``. ``default`` is the limit if a study gives
     none. ``one_axis`` is True if the figure is defined for one axis only. ``bands`` is
-    the number of values for each plant and branch. ``meaning`` describes the figure.
+    the number of values for each plant and branch. ``meaning`` describes the figure,
+    ``remedy`` is the advice if it violates its limit, in place of that to search again.
     """
 
     unit: str
@@ -80,6 +81,7 @@ class Constraint(NamedTuple):
     one_axis: bool = False
     bands: int = 1
     meaning: str = "Figure of another package"
+    remedy: str = ""
 
     def check(self, name: str, limit: Any) -> None:
         """Raise ValueError unless ``limit`` is a number in its bounds, or ``OFF``."""
@@ -232,6 +234,8 @@ CONSTRAINTS: dict[str, Constraint] = {
         "extremes",
         lambda found, dt: _largest(found.peak_slew) / dt,
         meaning="Largest rate of the voltage in the runs, after references.settle",
+        remedy="record faster motions (python -m piezojax.excite), give the slew rate "
+        "of the amplifier instead (actuator.slew_rate)",
     ),
     "effort": Constraint(
         "V rms",

@@ -239,8 +239,8 @@ def _missed(name: str, value: float | None, limit: float, where: str) -> str:
     side = "above" if kind.sense == "at most" else "below"
     shown = "not known" if value is None else f"{value:.3g}{unit}"
     return (
-        f"{name} is {shown} on {where}, {side} its limit {limit:g}{unit}: {_TIGHTEN}, "
-        f"or change constraints.{name}"
+        f"{name} is {shown} on {where}, {side} its limit {limit:g}{unit}: "
+        f"{kind.remedy or _TIGHTEN}, or change constraints.{name}"
     )
 
 

@@ -216,13 +216,13 @@ def _hysteresis_notes(case: Case) -> list[str]:
     """Return a note on the hysteresis that is assumed, or not, beyond the plant."""
     width = case.assumed_hysteresis
     if width > 0.0:
-        kept = "also hold" if steep_stage(case) else "are not checked"
+        checked = "are also" if steep_stage(case) else "are not"
         return [
             "the stage is assumed to have hysteresis that the plant lacks, a loop "
             f"whose width is {100.0 * width:.3g} % of its height over the references "
             "(disturbance.hysteresis): its deviation from the plant disturbs half of "
             "the runs, and the errors hold for stages with no wider loop; limits on "
-            f"margins {kept} at its largest gain"
+            f"margins {checked} checked at its largest gain"
         ]
     if case.plant_about.small_motions:
         return [

@@ -198,6 +198,10 @@ def test_the_heading_counts_the_alarms(alarms, heading):
             "effort is 99 V rms on 1 of 1 tuned plants, above its limit 50 V rms: be",
         ),
         (
+            {"holdout_constraints": {"peak_slew": outcome("peak_slew", [2e4], 1e4)}},
+            "above its limit 10000 V/s: record faster motions (python -m piezojax.exc",
+        ),
+        (
             {"perturbed": perturbed(effort=outcome("effort", [1.0, math.nan], 50.0))},
             "effort is not known on 1 of 2 held-out plants, above its limit",
         ),
