@@ -257,7 +257,8 @@ def _residual_notes(case: Case) -> list[str]:
     return [
         f"the fitted plant leaves {size} rms of its record unexplained; this residual "
         "is a disturbance of the loop, that of the training part while tuning, that of "
-        "the validation part in the hold-out"
+        "the validation part in the hold-out, and so is an error of its gain of the "
+        "same relative size"
     ]
 
 

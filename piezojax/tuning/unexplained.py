@@ -57,9 +57,10 @@ def unexplained_disturbances(
 ) -> Float[np.ndarray, "references stretches samples *axes"]:
     """Return what the plant of ``case`` leaves unexplained under each reference.
 
-    That is the sum of ``residual_disturbances`` and ``missing_hysteresis``. The latter
-    disturbs only the first stretch: gains that rely on a hysteresis would be poor on a
-    stage with less.
+    That is the sum of ``residual_disturbances``, ``gain_error`` and
+    ``missing_hysteresis``. The gain is too high under the first stretch and too low
+    under the second, and the hysteresis disturbs only the first: gains that rely on one
+    of them would be poor on a stage without it.
     """
     total = np.zeros((len(case.references), STRETCHES, *case.references.shape[1:]))
     if case.assumed_hysteresis > 0.0:
@@ -69,7 +70,33 @@ def unexplained_disturbances(
             residual_disturbances(case.residual, reference, time_s, part, loop)
             for reference in case.references
         ]
+        wrong = gain_error(case.residual, case.references, part)
+        total[:, 0] += wrong
+        total[:, 1] -= wrong
     return total
+
+
+def gain_error(
+    residual: ResidualRecord,
+    references: Float[np.ndarray, "references samples *axes"],
+    part: Part,
+) -> Float[np.ndarray, "references samples *axes"]:
+    """Return the error of a plant whose gain is wrong by the size of its ``residual``.
+
+    A model that errs on the motions of its record may err on others as much. On the
+    loop of a reference, which the record does not contain, this error has the frequency
+    of the reference: feedback that is too slow for it relies on the model. Stretches of
+    the residual do not show that. The size is the rms of the residual, relative to the
+    deviation of the simulated output, and at most 1. The error begins at 0, because the
+    loop begins at rest.
+    """
+    left, simulated = (
+        np.concatenate([getattr(one, name) for one in residual.parts[part]])
+        for name in ("residual", "simulated")
+    )
+    rms, moved = np.sqrt(np.mean(left**2, axis=0)), np.std(simulated, axis=0)
+    size = rms / np.maximum(np.maximum(rms, moved), np.finfo(float).tiny)
+    return size.reshape(references.shape[2:]) * (references - references[:, :1])
 
 
 def residual_disturbances(

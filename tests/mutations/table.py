@@ -378,6 +378,20 @@ MUTATIONS = (
         (_DATA, "-k", "assumed"),
     ),
     Mutation(
+        "a gain that is wrong in one direction",
+        "tuning/unexplained.py",
+        "total[:, 1] -= wrong",
+        "total[:, 1] += wrong",
+        (_DATA, "-k", "parts"),
+    ),
+    Mutation(
+        "a gain as wrong as in training",
+        "tuning/unexplained.py",
+        "name) for one in residual.parts[part]",
+        'name) for one in residual.parts["train"]',
+        (_DATA, "-k", "wrong_gain"),
+    ),
+    Mutation(
         "margins without the largest gain",
         "tuning/evaluator.py",
         "others += [level_stages(case.loop), steep_stage(case)]",

@@ -9,7 +9,7 @@ from stand_ins import fit_of
 
 from piezojax.core.paths import replace
 from piezojax.identification.records.record import Record
-from piezojax.identification.residual_record import ResidualRecord
+from piezojax.identification.residual_record import ResidualRecord, Stretch
 from piezojax.signals.missing_hysteresis import missing_hysteresis
 from piezojax.solve.clock import Clock
 from piezojax.study import Study, build
@@ -20,6 +20,7 @@ from piezojax.tuning.objective import FAILED_LOSS, Objective
 from piezojax.tuning.runs import Signals
 from piezojax.tuning.unexplained import (
     Suppression,
+    gain_error,
     residual_disturbances,
     suppression_of,
 )
@@ -94,12 +95,18 @@ def fitted(residual, **tables):
     return make_data(dataclasses.replace(case, fit=fit))
 
 
+BEGUN = np.asarray(case_of().references)
+BEGUN = BEGUN - BEGUN[:, :1]
+WRONG = np.stack([BEGUN, -BEGUN], axis=1)
+"""Errors of a gain that is wrong by 100 %, as that of a model that explains nothing."""
+
+
 def test_training_and_validation_parts_disturb_different_runs():
     # the initial loading, the rest of the training part, the validation part
     residual = np.repeat([9.0, 1.0, -2.0], [1, 199, 200])
     data = fitted(residual)
-    np.testing.assert_allclose(data.tuning.disturbance, np.full((2, 2, 400), 1.0))
-    np.testing.assert_allclose(data.holdout.disturbance, np.full((3, 2, 400), -2.0))
+    np.testing.assert_allclose(data.tuning.disturbance, 1.0 + WRONG[:2])
+    np.testing.assert_allclose(data.holdout.disturbance, -2.0 + WRONG)
 
 
 def test_an_assumed_hysteresis_disturbs_half_of_the_runs():
@@ -116,8 +123,28 @@ def test_an_assumed_hysteresis_disturbs_half_of_the_runs():
     # beside a residual
     data = fitted(np.repeat([9.0, 1.0, -2.0], [1, 199, 200]), **assumed)
     both = np.stack([expected, np.zeros_like(expected)], axis=1)
-    np.testing.assert_allclose(data.tuning.disturbance, 1.0 + both[:2])
-    np.testing.assert_allclose(data.holdout.disturbance, -2.0 + both)
+    np.testing.assert_allclose(data.tuning.disturbance, 1.0 + both[:2] + WRONG[:2])
+    np.testing.assert_allclose(data.holdout.disturbance, -2.0 + both + WRONG)
+
+
+@pytest.mark.parametrize("share", [0.03, -0.2, 3.0])
+def test_a_wrong_gain_of_the_model_is_found_from_its_residual(share):
+    """The record has large motions, the reference small ones around another place."""
+    time = np.arange(1000.0)
+    simulated = np.c_[40.0 * np.sin(time / 50.0), 7.0 * np.cos(time / 50.0)]
+    simulated = simulated[: 2 * round(50.0 * np.pi)]  # a whole period
+    stretch = Stretch(share * simulated, simulated)
+    none = Stretch(np.zeros_like(simulated), simulated)
+    residual = ResidualRecord(1e-3, {"train": (none,), "validate": (stretch,)})
+    references = np.stack([5.0 + np.sin(time / 30.0), 9.0 * np.cos(time / 10.0)], -1)
+    found = gain_error(residual, references[None], "validate")[0]
+    largest = min(abs(share), 1.0)
+    np.testing.assert_allclose(found, largest * (references - references[0]), rtol=1e-3)
+    # one axis
+    stretch = Stretch(stretch.residual[:, :1], simulated[:, :1])
+    residual = ResidualRecord(1e-3, {"train": (stretch,)})
+    single = gain_error(residual, references[None, :, 0], "train")
+    np.testing.assert_allclose(single[0], found[:, 0])
 
 
 REST, SLOW = np.zeros(400), 1e-9 * np.arange(400.0)
