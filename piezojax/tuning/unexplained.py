@@ -83,12 +83,12 @@ def gain_error(
 ) -> Float[np.ndarray, "references samples *axes"]:
     """Return the error of a plant whose gain is wrong by the size of its ``residual``.
 
-    A model that errs on the motions of its record may err on others as much. On the
-    loop of a reference, which the record does not contain, this error has the frequency
-    of the reference: feedback that is too slow for it relies on the model. Stretches of
-    the residual do not show that. The size is the rms of the residual, relative to the
-    deviation of the simulated output, and at most 1. The error begins at 0, because the
-    loop begins at rest.
+    A model that errs on the motions of its record may err as much on a reference, which
+    the record does not contain. This error has the frequency of the reference: a loop
+    whose feedback is too slow for it relies on the model. Stretches of the residual do
+    not show that. The size is the rms of the residual, relative to the deviation of the
+    simulated output, and at most 1. The error begins at 0, because the loop begins at
+    rest.
     """
     left, simulated = (
         np.concatenate([getattr(one, name) for one in residual.parts[part]])
