@@ -24,7 +24,7 @@ class Question(NamedTuple):
 QUESTIONS = {
     "lower": Question("lower limit of the voltage [V]"),
     "upper": Question("upper limit of the voltage [V]"),
-    "slew_rate": Question("slew rate of the amplifier, 0 if unknown [V/s]"),
+    "slew_rate": Question("largest slew rate of the voltage, 0 for no limit [V/s]"),
     "noise": Question("rms noise of the sensor [um]"),
     "hysteresis": Question(
         "width of the hysteresis loop that large motions have, relative to its height"

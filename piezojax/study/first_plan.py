@@ -128,8 +128,7 @@ class Plan:
     sees faster references, such as jumps, as ramps. ``controller`` is the name of a
     design. For a device, ``scale`` is that of its gains (V/um; 0 if it is unknown and
     to be assumed), and its positions range from ``lowest`` to ``highest``.
-    ``slew_rate`` is that of the amplifier, V/s; if it is 0, it is unknown, and the
-    voltage is to move at most at ``recorded_slew``, V/s, if that is not 0.
+    ``slew_rate`` is the largest one of the voltage, V/s; 0 is no limit.
     ``hysteresis`` is the relative width of the loop that the stage is assumed to have
     beyond the plant, None to assume none. Raises ValueError for values that no stage
     can have, and for unknown references or designs.
@@ -148,7 +147,6 @@ class Plan:
     lowest: float = 0.0
     highest: float = 1.0
     slew_rate: float = 0.0
-    recorded_slew: float = 0.0
     hysteresis: float | None = None
 
     def __post_init__(self):
@@ -203,9 +201,9 @@ def planned(shown: Shown, given: dict[str, Any]) -> Plan:
     Values of ``given`` that are not None replace the suggested ones. The limits are the
     lowest and highest voltage, and the references lie around the middle of the
     displacements. The slowest has at least ``SAMPLES_A_PERIOD`` samples in a period,
-    and needs at most ``RECORDED`` times the largest slew that is shown, which is
-    ``recorded_slew``. The limit of the slew is ``FASTER`` times the largest slew of the
-    references.
+    and needs at most ``RECORDED`` times the largest slew that is shown, which limits
+    that of the voltage. The limit of the slew of the references is ``FASTER`` times
+    their largest one.
 
     Raises ValueError as ``Plan`` does, and for references outside the displacements.
     """
@@ -225,7 +223,7 @@ def planned(shown: Shown, given: dict[str, Any]) -> Plan:
             "slew": 1.0,  # until the references are known
             "lowest": _rounded(low),
             "highest": _rounded(high),
-            "recorded_slew": _rounded(shown.slew or 0.0),
+            "slew_rate": _rounded(shown.slew or 0.0),
             "hysteresis": shown.hysteresis,
         }
         return Plan(**(suggested | known))

@@ -68,7 +68,6 @@ def first_study(
     device = plan.controller in DEVICES
     if device and not np.isclose(rate * FIXED_DT, 1.0, rtol=1e-9):
         raise ValueError(_OTHER_RATE[measured].format(rate, 1.0 / FIXED_DT))
-    slew_rate, peak_slew = _slew_limits(plan)
     values = {
         **{field.name: _toml(getattr(plan, field.name)) for field in fields(plan)},
         "title": _toml(
@@ -78,8 +77,7 @@ def first_study(
         "seed": _toml(seed),
         "fitted": _FITTED[measured],
         "plant": "\n".join(f"{key} = {_toml(value)}" for key, value in plant.items()),
-        "slew_rate": slew_rate,
-        "peak_slew": peak_slew,
+        "slew_rate": _SLEW_RATE.format(plan.slew_rate) if plan.slew_rate else "",
         "disturbance": "" if plan.hysteresis is None else _LOOP.format(plan.hysteresis),
         "controller": _controller(plan, 1.0 / rate),
         "parameters": _parameters(plan.controller),
@@ -149,7 +147,7 @@ settle = $settle
 # limits here: settling_time = 0.01, or, if the slew is not limited, closed_loop_peak =
 # 1.5.
 [constraints]
-$peak_slew
+
 [optimiser]
 method = "gauss_newton"
 starts = 4
@@ -196,8 +194,10 @@ _WITHIN = """
 """
 
 
-_AMPLIFIER = """\
-slew_rate = {!r} # of the amplifier, V/s
+_SLEW_RATE = """\
+# Largest slew rate of the voltage, V/s: that of the amplifier, or of the record, which
+# does not show whether the amplifier reaches more. Exported code keeps to it.
+slew_rate = {!r}
 """
 
 _LOOP = """\
@@ -208,21 +208,6 @@ _LOOP = """\
 hysteresis = {!r}
 
 """
-
-_AS_RECORDED = """\
-# Largest slew rate of the voltage in the record, V/s: the amplifier may not follow
-# faster motions. If its slew rate is known, set actuator.slew_rate instead.
-peak_slew = {!r}
-"""
-
-
-def _slew_limits(plan: Plan) -> tuple[str, str]:
-    """Return the keys for the slew rate in ``[actuator]`` and in ``[constraints]``."""
-    if plan.slew_rate > 0.0:
-        return _AMPLIFIER.format(plan.slew_rate), ""
-    if plan.recorded_slew > 0.0:
-        return "", _AS_RECORDED.format(plan.recorded_slew)
-    return "", ""
 
 
 def _parameters(controller: str) -> str:

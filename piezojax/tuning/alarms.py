@@ -32,6 +32,8 @@ OVERSHOOT = 1.0
 """Largest overshoot of a large step without an alarm, as a share of its height. A
 larger one leaves the range in which the model was tested, or that of the stage."""
 
+_LIMITED = "stays at a limit of the voltage or of its slew rate"
+
 _TIGHTEN = (
     "begin with gains of a stable loop, lower the bounds of the gains, or raise "
     "'candidates' and 'steps'"
@@ -92,7 +94,7 @@ def _run_alarms(scores: Mapping[str, Scores | None]) -> Iterable[str]:
             for name, share in part.saturated_percent.items()
             if share > 100.0 * RAILED and name not in lost
         ]
-        for names, what in ((lost, "diverges"), (railed, "stays at a voltage limit")):
+        for names, what in ((lost, "diverges"), (railed, _LIMITED)):
             if names:
                 yield (
                     f"the tuned loop {what} on {where} runs of {', '.join(names)}: "

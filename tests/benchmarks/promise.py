@@ -159,8 +159,12 @@ def led_to(stage, reading):
     return min(max(voltage, p.lower), p.upper), z
 
 
-def followed(controller, stage, reference, limits):
-    """Run a controller on a stage; return voltages, sensed tips and tips [samples]."""
+def followed(controller, stage, reference, drive):
+    """Run a controller on a stage; return voltages, sensed tips and tips [samples].
+
+    ``drive`` has the limits of the voltage, and of its slew rate if it is limited.
+    """
+    most = drive.get("slew_rate", np.inf) * stage.dt
     found = np.zeros((3, len(reference)))
     following = np.append(reference[1:], reference[-1])
     voltage, z = led_to(stage, reference[0])
@@ -173,7 +177,8 @@ def followed(controller, stage, reference, limits):
         if not np.isfinite(command):
             found[:, k:] = np.nan
             break
-        found[0, k] = voltage = min(max(float(command), limits[0]), limits[1])
+        within = min(max(float(command), drive["lower"]), drive["upper"])
+        found[0, k] = voltage = min(max(within, voltage - most), voltage + most)
         z = stage.step(voltage)
     return found
 
@@ -181,8 +186,7 @@ def followed(controller, stage, reference, limits):
 def judged(outcome, setup, seed=100):
     """Return the figures of the tuned gains on the stage of ``setup``, by reference."""
     table, p = setup.study["references"], setup.stage.parameters
-    drive = setup.study["actuator"]
-    limits, first = (drive["lower"], drive["upper"]), round(table["settle"] * p.rate)
+    drive, first = setup.study["actuator"], round(table["settle"] * p.rate)
     controller = pj.core.system.resolve(outcome.controller)
     time_s = pj.signals.time_grid(table["duration"], p.rate)
     result, figures = outcome.result, {}
@@ -194,14 +198,14 @@ def judged(outcome, setup, seed=100):
             pj.signals.signal(name, time_s, table["amplitude"], table["offset"])
         )
         setup.stage.reset(0.0, seed + number)
-        u, sensed, tip = followed(controller, setup.stage, r, limits)[:, first:]
+        u, sensed, tip = followed(controller, setup.stage, r, drive)[:, first:]
         r = r[first:]
         error = float(np.sqrt(np.mean((sensed - r) ** 2)))
         figures[name] = {
             "promised": promises[name],
             "obtained": error,
             "tip": float(np.sqrt(np.mean((tip - r) ** 2))),
-            "railed": float(np.mean((u <= limits[0]) | (u >= limits[1]))),
+            "railed": float(np.mean((u <= drive["lower"]) | (u >= drive["upper"]))),
             "lost": not error < max(LOST * np.std(r), FAR * (promises[name] or 0.0)),
         }
     return figures

@@ -181,7 +181,8 @@ def test_the_heading_counts_the_alarms(alarms, heading):
         ({"after": scores(rms=None)}, "diverges on tuning runs of SW30: reduce the"),
         (
             {"holdout": scores(saturated=91.0)},
-            "stays at a voltage limit on hold-out runs of SW30: reduce",
+            "stays at a limit of the voltage or of its slew rate on hold-out runs of "
+            "SW30: reduce",
         ),
         ({"unseen": scores(rms=None)}, "diverges on unseen runs of SW30"),
         (
@@ -271,7 +272,8 @@ def test_lower_limits_are_violated_from_below():
 def test_a_run_is_saturated_from_a_share_of_its_samples():
     (alarm,) = alarms(changed(holdout=scores(saturated=90.1)))
     assert alarm.startswith(
-        "the tuned loop stays at a voltage limit on hold-out runs of SW30"
+        "the tuned loop stays at a limit of the voltage or of its slew rate on "
+        "hold-out runs of SW30"
     )
     assert alarms(changed(holdout=scores(saturated=89.9))) == []
 
