@@ -207,7 +207,8 @@ def _warnings(
         railed = [n for n, share in figures.saturated_percent.items() if share > 0]
         if railed:
             found.append(
-                f"the actuator saturates on {where} runs of {', '.join(railed)}"
+                f"the actuator saturates on {where} runs of {', '.join(railed)}: a "
+                "controller of your own needs the limits of [actuator], too"
             )
     return found
 

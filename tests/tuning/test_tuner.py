@@ -403,7 +403,10 @@ def test_saturation_is_reported():
     for part in (result.after, result.holdout):
         assert all(share > 1.0 for share in part.saturated_percent.values())
     for where in ("tuning", "hold-out"):
-        text = f"the actuator saturates on {where} runs of SIN50, SW50"
+        text = (
+            f"the actuator saturates on {where} runs of SIN50, SW50: a controller of "
+            "your own needs the limits of [actuator], too"
+        )
         assert text in result.warnings
 
 
