@@ -144,8 +144,8 @@ settle = $settle
 
 # By default the sensitivity peak is limited to 2.0 and the delay margin to one sample,
 # for every stage within the error bound of the fitted model. Write further goals as
-# limits here: settling_time = 0.01, or, if the slew is not limited, closed_loop_peak =
-# 1.5.
+# limits here: settling_time = 0.01, or, if the slew of the reference is not limited,
+# closed_loop_peak = 1.5.
 [constraints]
 
 [optimiser]
