@@ -82,7 +82,7 @@ def as_matrix(value: Any) -> Array:
     return matrix
 
 
-def _concrete(value: Any) -> np.ndarray | None:
+def concrete(value: Any) -> np.ndarray | None:
     """Return ``value`` as a NumPy array, or None for a JAX tracer."""
     if isinstance(value, Tracer):
         return None
@@ -111,7 +111,7 @@ def check(
     checked, because their numbers are not known yet.
     """
     for element in jax.tree.leaves(value):
-        number = _concrete(element)
+        number = concrete(element)
         if number is None:
             continue
         inside = (
@@ -134,7 +134,7 @@ def check(
 
 def check_not_zero(name: str, value: Any) -> None:
     """Raise ValueError if ``value`` is zero; traced values are not checked."""
-    number = _concrete(value)
+    number = concrete(value)
     if number is not None and np.any(number == 0.0):
         raise ValueError(f"{name} is 0; it must be another number")
 
@@ -154,7 +154,7 @@ def check_order(
 
     Traced values are not checked.
     """
-    lower, upper = _concrete(low), _concrete(high)
+    lower, upper = concrete(low), concrete(high)
     if lower is None or upper is None:
         return
     if not np.all(lower <= upper if equal else lower < upper):

@@ -103,11 +103,9 @@ class Space(eqx.Module):
 
     def ranges(self) -> dict[str, Range]:
         """Return the Range of each parameter by path."""
-        rows = zip(self.lower, self.upper, self.scales, self.steps, strict=True)
-        ranges = [
-            Range(float(low), float(high), scale, step=step)
-            for low, high, scale, step in rows
-        ]
+        lower, upper = np.asarray(self.lower).tolist(), np.asarray(self.upper).tolist()
+        rows = zip(lower, upper, self.scales, self.steps, strict=True)
+        ranges = [Range(low, high, scale, step=step) for low, high, scale, step in rows]
         return dict(zip(self.paths, ranges, strict=True))
 
     def start(self, system: System) -> Float[Array, " n"]:
@@ -116,17 +114,16 @@ class Space(eqx.Module):
         A parameter on a bound is moved inside by ``INSIDE``. Raises ValueError for a
         parameter outside its bounds.
         """
-        values = as_array([get(system, path) for path in self.paths])
-        for path, value, low, high in zip(
-            self.paths, values, self.lower, self.upper, strict=True
-        ):
+        values = np.asarray([get(system, path) for path in self.paths], float)
+        bounds = np.asarray(self.lower), np.asarray(self.upper)
+        for path, value, low, high in zip(self.paths, values, *bounds, strict=True):
             if not low <= value <= high:
                 raise ValueError(
-                    f"{path} starts at {float(value):g}; its bounds "
-                    f"{float(low):g} to {float(high):g} must include the start: set "
-                    "the start or the bounds in the study"
+                    f"{path} starts at {value:g}; its bounds {low:g} to {high:g} must "
+                    "include the start: set the start or the bounds in the study"
                 )
-        return jnp.clip(self.to_unit(values), INSIDE, 1.0 - INSIDE)
+        unit = np.asarray(self.to_unit(values))
+        return as_array(np.clip(unit, INSIDE, 1.0 - INSIDE))
 
     def _map(self, values: Array, direction: int) -> Array:
         mapped = [
@@ -160,6 +157,7 @@ class Space(eqx.Module):
         """Return ``system`` with its tuned parameters at ``unit``."""
         return replace(system, self.named(unit))
 
+    @jax.jit
     def named(self, unit: Float[Array, " n"]) -> dict[str, Array]:
         """Return the parameter values at ``unit`` by path."""
         return dict(zip(self.paths, self.from_unit(unit), strict=True))
@@ -178,8 +176,8 @@ def space_of(ranges: Mapping[str, Range]) -> Space:
     return Space(
         paths=tuple(ranges),
         scales=tuple(bounds.scale for bounds in ranges.values()),
-        lower=as_array([bounds.lower for bounds in ranges.values()]),
-        upper=as_array([bounds.upper for bounds in ranges.values()]),
+        lower=as_array(np.array([bounds.lower for bounds in ranges.values()], float)),
+        upper=as_array(np.array([bounds.upper for bounds in ranges.values()], float)),
         steps=tuple(bounds.step for bounds in ranges.values()),
     )
 
@@ -189,6 +187,7 @@ def squash(free: Array) -> Array:
     return jax.nn.sigmoid(free)
 
 
+@jax.jit
 def unsquash(unit: Array) -> Array:
     """Map (0, 1) onto the real line, the inverse of ``squash``."""
     return jnp.log(unit) - jnp.log1p(-unit)

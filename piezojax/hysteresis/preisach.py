@@ -17,6 +17,7 @@ from ..core.arrays import (
     as_matrix,
     check,
     check_order,
+    concrete,
 )
 from ..core.parameter import parameter
 from ..core.system import Designed, System
@@ -106,8 +107,10 @@ def check_weights(name: str, weights: Matrix) -> None:
     rows, columns = weights.shape
     if rows != columns or not rows:
         raise ValueError(f"{name} are {rows} x {columns}; they must be n x n, n >= 1")
-    above = weights[np.triu_indices(rows, 1)]
-    check(f"{name} where beta is above alpha", above, least=0.0, most=0.0)
+    numbers = concrete(weights)
+    if numbers is not None:
+        above = np.triu(numbers, 1)
+        check(f"{name} where beta is above alpha", above, least=0.0, most=0.0)
 
 
 @jax.jit

@@ -5,7 +5,6 @@ from itertools import product
 
 import numpy as np
 
-from ..core.arrays import as_array
 from ..core.paths import get, replace
 from ..core.recipe import Extent, Recipe, scaled_range
 from ..core.registry import parts as known_parts
@@ -290,5 +289,5 @@ def _starts(system: Series, space: Space, parts: Mapping[str, Recipe]) -> np.nda
 
 def point_of(system: System, space: Space) -> np.ndarray:
     """Return the parameters of ``system`` as a point inside the unit box."""
-    values = as_array([get(system, path) for path in space.paths])
+    values = np.array([get(system, path) for path in space.paths], float)
     return np.clip(np.asarray(space.to_unit(values)), INSIDE, 1.0 - INSIDE)

@@ -135,8 +135,13 @@ def in_batches(
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *results)
 
 
+def rows_of(points: Any, rows: np.ndarray) -> Any:
+    """Return the ``rows`` of every leaf. (Rows of a JAX array would be a program.)"""
+    return jax.tree.map(lambda x: as_array(np.asarray(x)[rows]), points)
+
+
 def _on_batch(program: Callable[[Any], Any], points: Any, batch: np.ndarray) -> Any:
-    return program(jax.tree.map(lambda x: as_array(x[batch]), points))
+    return program(rows_of(points, batch))
 
 
 class BatchedDescents:

@@ -24,7 +24,7 @@ from ..core.feedback import Feedback
 from ..core.metrics import ExtremeFigures, Extremes, TrackingFigures
 from ..core.rollout import Metric
 from ..solve.clock import Clock
-from ..solve.multi_start import in_batches, in_threads
+from ..solve.multi_start import in_batches, in_threads, rows_of
 from ..study import Case, Stage
 from ..study.ensemble import Part
 from .data import held, own_stage
@@ -139,7 +139,7 @@ class Evaluator:
             return eqx.combine(batch, static), *arguments
 
         compiled = self._clock.compiled(
-            program, *with_arguments(jax.tree.map(lambda x: x[first], dynamic))
+            program, *with_arguments(rows_of(dynamic, first))
         )
         found = in_batches(
             lambda batch: compiled(*with_arguments(batch)),

@@ -306,9 +306,10 @@ def values_and_errors(optimum: Optimum) -> tuple[np.ndarray, list[float | None]]
     error None.
     """
     problem, free = optimum.problem, unsquash(as_array(optimum.units))
-    values, slopes = map(np.asarray, _parameters(problem, free[0]))
+    best = as_array(np.asarray(free)[0])
+    values, slopes = map(np.asarray, _parameters(problem, best))
     # All points, because the program of the descents is compiled for their number.
-    curvature = np.asarray(_normal_equations(problem, free)[2][0])
+    curvature = np.asarray(_normal_equations(problem, free)[2])[0]
     slopes = np.where(slopes == 0.0, 1.0, slopes)
     kinds = 2 if problem.whitening.size and float(problem.plain) else 1
     counted = kinds * int(np.sum(np.asarray(problem.weights) > 0))
