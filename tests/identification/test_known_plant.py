@@ -58,6 +58,11 @@ def fitted(system, levels=(30.0, 45.0)):
     return identify(records, start.model, options=Options(known=start))
 
 
+@pytest.fixture(scope="module")
+def unchanged():
+    return fitted(plant())
+
+
 def test_a_changed_stage_is_found_from_small_steps():
     fit = fitted(plant(gain=1.2, frequency=660.0, damping=0.02, delay=1.5))
     found = {path: one.value for path, one in fit.report.parameters.items()}
@@ -70,12 +75,11 @@ def test_a_changed_stage_is_found_from_small_steps():
     assert gain == pytest.approx(1.2 * 0.06, rel=0.03)
 
 
-def test_an_unchanged_stage_keeps_its_parameters():
-    fit = fitted(plant())
+def test_an_unchanged_stage_keeps_its_parameters(unchanged):
     start = known()
     for path in ERRORS:
         value = float(get(start.system, path))
-        assert float(get(fit.plant, path)) == pytest.approx(value, rel=0.05)
+        assert float(get(unchanged.plant, path)) == pytest.approx(value, rel=0.05)
 
 
 def test_what_records_do_not_show_keeps_its_value():
@@ -213,16 +217,15 @@ def test_the_search_also_starts_at_the_resonance_of_the_record_and_later():
     assert delays == pytest.approx([0.0, 0.0, DT, DT], abs=1e-3 * DT)
 
 
-def test_the_range_of_the_known_record_remains():
-    fit = fitted(plant())
-    assert fit.about.input_ranges == [(0.0, 100.0)]
-    assert fit.about.input_slews == []  # those of the known record are not known
+def test_the_range_of_the_known_record_remains(unchanged):
+    assert unchanged.about.input_ranges == [(0.0, 100.0)]
+    assert unchanged.about.input_slews == []  # those of the known record are not known
     fast, slow = (
-        fit.known.about.model_copy(update={"input_slews": [slew]})
+        unchanged.known.about.model_copy(update={"input_slews": [slew]})
         for slew in (20.0, 10.0)
     )
     for first, second in ((fast, slow), (slow, fast)):
-        plant_known = dataclasses.replace(fit.known, about=first)
+        plant_known = dataclasses.replace(unchanged.known, about=first)
         assert plant_known.widened(second).input_slews == [20.0]
 
 
