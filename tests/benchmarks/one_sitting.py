@@ -2,6 +2,7 @@
 
     python tests/benchmarks/one_sitting.py [--stages 0:40:2] [--device NAME] [--excite]
     python tests/benchmarks/one_sitting.py --response [--stages 0:40:2]
+    python tests/benchmarks/one_sitting.py --treated NAME [--stages 0:40:2]
 
 The record of each stage of tests/oracles is written in one of four dialects of files.
 ``start`` gets that file and ``--yes``, nothing else. The voltages are those of the
@@ -11,7 +12,9 @@ stage as in promise.py, whose figures and bar the table has; the bar on the rati
 values of that device are tuned, with a scale of 9.3 V/um, on the stages whose record
 has its rate. With ``--response``, ``start`` gets the frequency response of each stage
 instead, measured with small motions around the middle of the voltages, and the limits
-and noise of the stage. The zero of its sensor is then at 0 V.
+and noise of the stage. The zero of its sensor is then at 0 V. With ``--treated`` the
+records are smoothed, shifted or rounded before they are written (treatments.py): the
+promise must be kept or the result have an alarm.
 """
 
 import argparse
@@ -31,6 +34,7 @@ import promise
 from oracles import excitation, forty_stages
 from rich.console import Console
 from rich.table import Table
+from treatments import TREATMENTS, treated
 
 import piezojax as pj
 from piezojax.control.devices import DEVICE_DESIGNS
@@ -212,12 +216,15 @@ def main():
     parser.add_argument("--stages", default="0:40:2", metavar="FIRST:STOP:STEP")
     parser.add_argument("--excite", action="store_true", help="piezojax.excite records")
     parser.add_argument("--response", action="store_true", help="frequency responses")
+    parser.add_argument("--treated", choices=TREATMENTS, help="before it is written")
     parser.add_argument("--device", choices=DEVICE_DESIGNS)
     parser.add_argument("--json", type=Path)
     chosen = parser.parse_args()
     console = Console(width=None if sys.stdout.isatty() else 120)
     numbers = range(*(int(number) for number in chosen.stages.split(":")))
     record_of = excited if chosen.excite else excitation.record
+    if chosen.treated:
+        record_of = treated(record_of, chosen.treated)
     options, lines = [], []
     if chosen.device:
         options = ["--controller", chosen.device, "--scale", "9.3"]
