@@ -114,16 +114,26 @@ class Space(eqx.Module):
         A parameter on a bound is moved inside by ``INSIDE``. Raises ValueError for a
         parameter outside its bounds.
         """
-        values = np.asarray([get(system, path) for path in self.paths], float)
         bounds = np.asarray(self.lower), np.asarray(self.upper)
+        values = self._values(system)
         for path, value, low, high in zip(self.paths, values, *bounds, strict=True):
             if not low <= value <= high:
                 raise ValueError(
                     f"{path} starts at {value:g}; its bounds {low:g} to {high:g} must "
                     "include the start: set the start or the bounds in the study"
                 )
-        unit = np.asarray(self.to_unit(values))
-        return as_array(np.clip(unit, INSIDE, 1.0 - INSIDE))
+        return as_array(self.nearest(system))
+
+    def nearest(self, system: System) -> np.ndarray:
+        """Return the parameters of ``system`` as a point [n] inside the unit box.
+
+        A parameter on a bound or beyond it is moved inside by ``INSIDE``.
+        """
+        unit = np.asarray(self.to_unit(self._values(system)))
+        return np.clip(unit, INSIDE, 1.0 - INSIDE)
+
+    def _values(self, system: System) -> np.ndarray:
+        return np.asarray([get(system, path) for path in self.paths], float)
 
     def _map(self, values: Array, direction: int) -> Array:
         mapped = [

@@ -5,11 +5,11 @@ from itertools import product
 
 import numpy as np
 
-from ..core.paths import get, replace
+from ..core.paths import replace
 from ..core.recipe import Extent, Recipe, scaled_range
 from ..core.registry import parts as known_parts
-from ..core.space import INSIDE, Range, Space, space_of
-from ..core.system import Affine, Series, System, series
+from ..core.space import Range, Space, space_of
+from ..core.system import Affine, Series, series
 from ..hysteresis.model import Hysteresis
 from .estimators.resonances import LinearDynamics, linear_dynamics
 from .estimators.slew_rate import few_steps, has_steps
@@ -283,11 +283,5 @@ def _starts(system: Series, space: Space, parts: Mapping[str, Recipe]) -> np.nda
     for combination in product(*choices):
         changes = {path: value for one in combination for path, value in one.items()}
         changed = replace(system, changes)
-        found.append(point_of(changed, space))
+        found.append(space.nearest(changed))
     return distinct(np.stack(found))
-
-
-def point_of(system: System, space: Space) -> np.ndarray:
-    """Return the parameters of ``system`` as a point inside the unit box."""
-    values = np.array([get(system, path) for path in space.paths], float)
-    return np.clip(np.asarray(space.to_unit(values)), INSIDE, 1.0 - INSIDE)

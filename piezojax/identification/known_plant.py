@@ -18,7 +18,7 @@ from ..core.registry import parts as known_parts
 from ..core.space import Range, space_of
 from ..core.system import Affine, Series, System
 from ..dynamics import FractionalDelay
-from .chain import LINEAR, by_evidence, dynamics_of, is_own, point_of
+from .chain import LINEAR, by_evidence, dynamics_of, is_own
 from .estimators.structure import Prior, Structure
 from .records.record import Record
 
@@ -82,7 +82,7 @@ class KnownPlant:
         deviations = self._deviations(system, best.dt)
         ranges = {path: _range(system, path, s) for path, s in deviations.items()}
         space = space_of(ranges)
-        known = point_of(system, space)
+        known = space.nearest(system)
         spans = np.array([record.span for record in records])
         if not self.held:
             spans = np.full_like(spans, spans.max())
@@ -96,7 +96,7 @@ class KnownPlant:
         resonances = [mode.frequency for mode in shown.modes]
         moved = _at_resonances(system, ranges, resonances)
         later = [_later(one, ranges, best.dt) for one in (moved, system)]
-        starts = [point_of(one, space) for one in (moved, system, *later)]
+        starts = [space.nearest(one) for one in (moved, system, *later)]
         return Structure(
             system,
             space,

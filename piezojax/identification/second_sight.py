@@ -14,7 +14,7 @@ import numpy as np
 from ..core.paths import get, replace
 from ..core.progress import Progress
 from ..core.system import Series, System, series
-from .chain import LINEAR, by_evidence, dynamics_of, point_of, structure
+from .chain import LINEAR, by_evidence, dynamics_of, structure
 from .estimators.approach import run_after
 from .estimators.free_runs import starts_of
 from .estimators.output_error import ROUGH_STEPS, output_error
@@ -67,7 +67,7 @@ def seen_again(
         again = structure(model, first, beside=beside, shown=shown)
         kept = set(rough.problem.space.paths) & set(again.space.paths)
         values = {path: get(rough.system, path) for path in kept - set(again.dynamics)}
-        start = point_of(replace(again.system, values), again.space)
+        start = again.space.nearest(replace(again.system, values))
         shape = again._replace(starts=start[None], guess=again.starts[0])
         if _equal(shown, last):
             break
