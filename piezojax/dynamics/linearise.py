@@ -41,6 +41,14 @@ def linearise(
     dt = sample_time(system) if dt is None else dt
     input = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), input)
     state = system.init(input) if state is None else state
+    return StateSpace(*_derivatives(system, state, input), dt)
+
+
+@eqx.filter_jit
+def _derivatives(
+    system: System, state: State, input: Any
+) -> tuple[Array, Array, Array, Array]:
+    """Return A, B, C and D in one program: eagerly each operation would be one."""
     moving, held = split_static(state)
     x, unravel_state = ravel_pytree(moving)
     u, unravel_input = ravel_pytree(input)
@@ -51,7 +59,7 @@ def linearise(
         return ravel_pytree(split_static(state)[0])[0], ravel_pytree(output)[0]
 
     (A, B), (C, D) = jax.jacfwd(step, argnums=(0, 1))(x, u)
-    return StateSpace(A, B, C, D, dt)
+    return A, B, C, D
 
 
 def split_static(state: State) -> tuple[State, State]:
