@@ -23,7 +23,7 @@ from .estimators.resonances import LinearDynamics
 from .held_dynamics import HeldDynamics, combined_bound
 from .known_plant import KnownPlant
 from .methods import method_for
-from .plausibility import assumed_units, plausibility_warnings
+from .plausibility import assumed_units, early_warnings, plausibility_warnings
 from .records.checks import record_warnings
 from .records.parts import check_compatible, check_train, train_and_validation
 from .records.record import Record
@@ -275,6 +275,8 @@ def identify(
 
     runs = estimate.simulations
     alarms = of_each(plausibility_warnings)
+    if not estimate.closed_loop:
+        alarms += of_each(partial(early_warnings, train=train))
     alarms += feedback[0]
     alarms += _error_warnings(records, runs, validate)
     gains = ([], []) if held is None else held.gain_notes(records[0])

@@ -6,6 +6,7 @@ import numpy as np
 
 from .estimators.loop_response import joint_response
 from .estimators.projection import excited_part
+from .estimators.resonances import samples_early
 from .estimators.welch import spectral_response
 from .records.record import Record, rises_evenly
 
@@ -36,6 +37,29 @@ def plausibility_warnings(record: Record) -> list[str]:
     if clocks or record.inputs.shape[1] != 1 or record.outputs.shape[1] != 1:
         return clocks
     return [*_relation(record), *_units(record)]
+
+
+def early_warnings(record: Record, train: slice) -> list[str]:
+    """Return a warning if the output answers the input sooner than in a loop.
+
+    For a record of one input and one output in an open loop; ``train`` are the samples
+    of the fit.
+    """
+    if record.closed_loop or (record.inputs.shape[1], record.outputs.shape[1]) != (
+        1,
+        1,
+    ):
+        return []
+    seen = record.until(train.stop)
+    early = samples_early(seen.input, seen.output, record.dt)
+    if not early:
+        return []
+    return [
+        f"the output answers the input {early:.2g} samples sooner than a loop can read "
+        "it: it was saved too early, or the input too late, so the loop has more delay "
+        "than the model; in each row save the output that is read when the input of "
+        "this row is put out"
+    ]
 
 
 def assumed_units(record: Record) -> list[str]:

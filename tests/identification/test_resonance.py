@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import scipy.signal
+from oracles import excitation, forty_stages
 from oracles import resonant_records as records
 
 from piezojax import Record, identify
@@ -11,7 +12,9 @@ from piezojax.identification.estimators.refined import refined_instrumental_vari
 from piezojax.identification.estimators.resonances import (
     LinearDynamics,
     linear_dynamics,
+    samples_early,
 )
+from piezojax.identification.plausibility import early_warnings
 
 DT = 1.0 / records.RATE
 FREQUENCY, DAMPING = 0.01, 0.2
@@ -69,6 +72,45 @@ def test_a_delay_is_distinguished_from_a_resonance():
     found = linear_dynamics(input, np.r_[np.full(3, output[0]), output[:-3]], DT)
     check(found.modes[0], records.NAMED)
     assert found.delay == pytest.approx(3 * DT, abs=0.2 * DT)
+
+
+def moved_ahead(output, samples):
+    return np.r_[output[samples:], np.full(samples, output[-1])]
+
+
+@pytest.mark.parametrize("case", CASES[::3], ids=lambda c: f"{c.excitation}-{c.seed}")
+def test_no_output_is_early(case):
+    assert samples_early(*records.measured(case), DT) == 0.0
+
+
+@pytest.mark.parametrize("lag", [0.0, 3e-4])
+@pytest.mark.parametrize("kind", records.EXCITATIONS)
+def test_an_output_saved_early_is_noticed(kind, lag):
+    case = records.Case(kind, lag=lag, seconds=0.5)
+    input, output = records.measured(case)
+    found = samples_early(input, moved_ahead(output, 2), DT)
+    assert found == pytest.approx(2.0, abs=0.3)
+
+
+def test_without_a_resonance_no_output_is_early():
+    input, output = records.measured(records.Case("PRBS", frequency=None, seconds=1.0))
+    assert samples_early(input, moved_ahead(output, 2), DT) == 0.0
+    assert samples_early(input[:100], output[:100], DT) == 0.0
+
+
+@pytest.mark.parametrize(("number", "early"), [(14, 0.5), (12, 2.0)])
+def test_an_early_output_of_another_class_has_an_alarm(number, early):
+    """The stages have 1.5 samples of delay and none; their outputs are 2 ahead."""
+    stage = forty_stages.stage(number)
+    input, output = excitation.record(stage)
+    train = slice(0, len(input) // 2)
+    assert early_warnings(Record(input, output, stage.dt), train) == []
+    shifted = Record(input, moved_ahead(output, 2), stage.dt)
+    (alarm,) = early_warnings(shifted, train)
+    assert "sooner than a loop can read it" in alarm
+    assert float(alarm.split()[5]) == pytest.approx(early, abs=0.2)
+    loop = Record(shifted.input, shifted.output, stage.dt, reference=shifted.output)
+    assert early_warnings(loop, train) == []
 
 
 def test_the_slope_is_that_of_the_hysteresis_and_not_of_the_overshoot():

@@ -398,6 +398,21 @@ MUTATIONS = (
         "others += [level_stages(case.loop)]",
         ("tests/tuning/test_steep_stage.py",),
     ),
+    # Outputs that were saved early
+    Mutation(
+        "early outputs that hide their resonance",
+        "identification/estimators/resonances.py",
+        "early > EARLY and (negative or better)",
+        "early > EARLY and negative",
+        ("tests/identification/test_resonance.py", "-k", "early"),
+    ),
+    Mutation(
+        "early outputs by a model that fits worse",
+        "identification/estimators/resonances.py",
+        "early > EARLY and (negative or better)",
+        "early > EARLY",
+        ("tests/identification/test_resonance.py", "-k", "early"),
+    ),
     # Two searches
     Mutation(
         "a second search without the end of the first",

@@ -58,6 +58,17 @@ HIGHEST = 0.45
 DAMPED = 0.5
 """Damping ratio above which a pair of poles is not a resonance."""
 
+EARLY = 0.4
+"""Least samples by which an output is early; records of stages without a delay seemed
+0.06 samples early at the most."""
+
+BETTER = 0.9
+"""Factor by which delaying an early output lowers the white error; that of an output
+saved in time went to 0.92 of itself at the least."""
+
+LATER = 3
+"""Number of samples by which an output is delayed to see whether it is early."""
+
 WHOLE = 0.1
 """Least static gain of all modes together, as a share of the response at the slowest
 frequencies. The stage moves through its modes, so that the share is near 1, or a third
@@ -72,11 +83,11 @@ the record explains."""
 class LinearDynamics(NamedTuple):
     """Resonances, strongest first, time constants of lags (s) and the delay (s).
 
-    ``delay`` is in excess of the one sample between input and output. ``slope`` is that
-    of the output over the full range of the input, below the resonances. Both are None
-    if no dynamics could be identified. ``whitening`` is the filter of the errors.
-    ``slew`` is the slew rate of the input in ``input_unit`` per s, None if the input
-    shows no limit.
+    ``delay`` is in excess of the one sample between input and output, and negative if
+    the output answers sooner. ``slope`` is that of the output over the full range of
+    the input, below the resonances. Both are None if no dynamics could be identified.
+    ``whitening`` is the filter of the errors. ``slew`` is the slew rate of the input in
+    ``input_unit`` per s, None if the input shows no limit.
     """
 
     modes: tuple[Resonance, ...] = ()
@@ -107,14 +118,14 @@ def linear_dynamics(input: np.ndarray, output: np.ndarray, dt: float) -> LinearD
     """
     return _found(
         np.asarray(input, float).tobytes(), np.asarray(output, float).tobytes(), dt
-    )
+    )[0]
 
 
 @lru_cache(maxsize=4)
-def _found(input: bytes, output: bytes, dt: float) -> LinearDynamics:
+def _found(input: bytes, output: bytes, dt: float) -> "_Found":
     x, y = _liveliest(np.frombuffer(input), np.frombuffer(output))
     if x.size < SHORTEST:
-        return LinearDynamics()
+        return LinearDynamics(), None
     moved = _above_slowest(y)
 
     def cost(x: np.ndarray) -> float:
@@ -129,8 +140,35 @@ def _found(input: bytes, output: bytes, dt: float) -> LinearDynamics:
     rate = slew_rate(x, cost)
     x = x if rate is None else slewed(x, rate)
     slopes = 1.0 - 2.0 * np.array(THRESHOLDS)
-    found = _shown(_Signals(_play_outputs(x), slopes, moved), dt)
-    return found if rate is None else found._replace(slew=rate / dt)
+    found, model = _shown(_Signals(_play_outputs(x), slopes, moved), dt)
+    return found._replace(slew=None if rate is None else rate / dt), model
+
+
+def samples_early(input: np.ndarray, output: np.ndarray, dt: float) -> float:
+    """Return by how many samples ``output`` [samples] answers too soon, 0 if it is not.
+
+    In a loop the output of a sample is read before the input acts, so that no delay is
+    negative. The models have no room for one and become worse: an output is early if a
+    model fits it better when it is delayed by ``LATER`` samples, with a shorter delay
+    than these. Nothing is found without a resonance.
+    """
+    shown, model = _found(
+        np.asarray(input, float).tobytes(), np.asarray(output, float).tobytes(), dt
+    )
+    if model is None:
+        return 0.0
+    signals = model.signals.later(LATER)
+    later = _with_lag(signals, max(1, len(shown.modes)))
+    if later is None:
+        return 0.0
+    later = _delayed(signals, later)
+    again = _dynamics(later, dt)
+    if not again.modes:
+        return 0.0
+    early = LATER - (again.delay or 0.0) / dt
+    negative = bool(shown.modes) and (shown.delay or 0.0) < -EARLY * dt
+    better = _cost(later) < BETTER * _cost(model)
+    return early if early > EARLY and (negative or better) else 0.0
 
 
 def dynamics_behind(front: np.ndarray, output: np.ndarray, dt: float) -> LinearDynamics:
@@ -144,14 +182,18 @@ def dynamics_behind(front: np.ndarray, output: np.ndarray, dt: float) -> LinearD
     if x.size < SHORTEST:
         return LinearDynamics()
     signals = _Signals(_above_slowest(x)[None], np.ones(1), _above_slowest(y))
-    return _shown(signals, dt)
+    return _shown(signals, dt)[0]
 
 
-def _shown(signals: "_Signals", dt: float) -> LinearDynamics:
+def _shown(signals: "_Signals", dt: float) -> "_Found":
     try:
         model = _chosen(signals)
     except (ValueError, np.linalg.LinAlgError):
-        return LinearDynamics()
+        return LinearDynamics(), None
+    return _dynamics(model, dt), model
+
+
+def _dynamics(model: "_Hammerstein", dt: float) -> LinearDynamics:
     modes, lags = model.modes(dt), model.lags(dt)
     delay = model.extra_delay(modes, lags, dt)
     whitening = tuple(map(float, model.dynamics.noise))
@@ -194,6 +236,11 @@ class _Signals(NamedTuple):
     plays: np.ndarray
     slopes: np.ndarray
     output: np.ndarray
+
+    def later(self, samples: int) -> "_Signals":
+        """Return the signals with the output delayed by ``samples``."""
+        before = np.full(samples, self.output[0])
+        return self._replace(output=np.r_[before, self.output[:-samples]])
 
 
 class _Hammerstein(NamedTuple):
@@ -306,7 +353,11 @@ class _Hammerstein(NamedTuple):
         )
         rest = self.dynamics.response(cycles) / turn / held
         phase = np.unwrap(np.angle(rest * np.sign(np.real(rest[0]))))
-        return float(max(0.0, -(phase @ cycles) / (2.0 * np.pi * cycles @ cycles)) * dt)
+        return float(-(phase @ cycles) / (2.0 * np.pi * cycles @ cycles) * dt)
+
+
+_Found = tuple[LinearDynamics, _Hammerstein | None]
+"""What a record shows, and the model that shows it."""
 
 
 def _rates(mode: Resonance) -> tuple[complex, complex]:
