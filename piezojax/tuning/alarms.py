@@ -28,6 +28,10 @@ AMPLIFIED = 2.0
 DISAGREE = 5.0
 """Ratio of the errors on the hold-out to those of tuning without an alarm."""
 
+DELAYED = 2.0
+"""Largest delay margin (samples) with a note, if the plant is fitted to a record: rows
+of a record are often wrong by a sample, and a trigger may be by two."""
+
 OVERSHOOT = 1.0
 """Largest overshoot of a large step without an alarm, as a share of its height. A
 larger one leaves the range in which the model was tested, or that of the stage."""
@@ -81,6 +85,20 @@ def peak_notes(stability: StabilityReports) -> list[str]:
         f"the tuned loop amplifies references at {worst.closed_loop_peak_Hz:.4g} Hz by "
         f"{worst.closed_loop_peak:.3g}: filter references that contain this frequency, "
         "such as steps, or limit constraints.closed_loop_peak"
+    ]
+
+
+def delay_notes(stability: StabilityReports) -> list[str]:
+    """Return a note if the delay margin of the tuned loop is below ``DELAYED``."""
+    figures = [found for found in exact_figures(stability).values() if found]
+    known = [found["delay_margin"] for found in figures]
+    least = min((margin for margin in known if margin is not None), default=np.inf)
+    if least >= DELAYED:
+        return []
+    return [
+        f"the tuned loop is unstable with {least:.3g} samples more delay than the "
+        "record of its plant shows: check that no reading in the loop comes later than "
+        "in the record, or raise constraints.delay_margin"
     ]
 
 

@@ -12,7 +12,7 @@ from ..core.progress import Progress, Silent
 from ..solve.clock import Clock
 from ..study import Case, read, shipped
 from ..study.schema import NOTHING_TO_TUNE
-from .alarms import alarms_of, peak_notes
+from .alarms import alarms_of, delay_notes, peak_notes
 from .baselines import Budget, compare_baselines
 from .beside import FiguresBeside
 from .data import depends_on_loop, judging, make_data
@@ -129,6 +129,8 @@ def _tuned(
     except KeyboardInterrupt:
         result.status = "interrupted"
     result.warnings += peak_notes(stability)
+    if case.plant_about.record is not None:
+        result.warnings += delay_notes(stability)
     limits = table.limits
     result.on_response = margins_on_response(case, stability)
     outcome = Outcome(result, case.loop, after, case, data.holdout, None, stability)

@@ -12,7 +12,7 @@ from piezojax.catalog import p753, p753_stage
 from piezojax.report.step_pictures import steps_table
 from piezojax.report.tuning_pictures import write_results
 from piezojax.study import read
-from piezojax.tuning.alarms import peak_notes
+from piezojax.tuning.alarms import delay_notes, peak_notes
 from piezojax.tuning.result import load_result
 from piezojax.tuning.step_tests import StepResult
 
@@ -109,6 +109,24 @@ def test_a_loop_that_amplifies_its_reference_has_a_note():
     assert "the tuned loop amplifies references at" in note
     assert peak_notes(stability_reports({"after": slow}, 5.0)) == []
     assert peak_notes(stability_reports({"before": amplifying}, 5.0)) == []
+
+
+def test_a_small_delay_margin_has_a_note():
+    def loop(integral):
+        control = pj.control.PID(0.0, integral, dt=5e-5)
+        plant = p753_stage.stage()
+        return pj.Feedback(control, plant, p753.actuator(), pj.Sensor(0.0))
+
+    notes = {
+        integral: delay_notes(stability_reports({"after": loop(integral)}, 5.0))
+        for integral in (500.0, 3e4)
+    }
+    report = pj.stability_report(loop(3e4), 5.0)
+    assert report.stable
+    assert report.delay_margin_samples < 2.0
+    (note,) = notes.pop(3e4)
+    assert f"unstable with {report.delay_margin_samples:.3g} samples more" in note
+    assert notes == {500.0: []}
 
 
 @pytest.mark.parametrize(
