@@ -42,13 +42,11 @@ def plausibility_warnings(record: Record) -> list[str]:
 def early_warnings(record: Record, train: slice) -> list[str]:
     """Return a warning if the output answers the input sooner than in a loop.
 
-    For a record of one input and one output in an open loop; ``train`` are the samples
-    of the fit.
+    Only a record of one input and one output in an open loop is checked. ``train`` are
+    the samples of the fit.
     """
-    if record.closed_loop or (record.inputs.shape[1], record.outputs.shape[1]) != (
-        1,
-        1,
-    ):
+    channels = record.inputs.shape[1], record.outputs.shape[1]
+    if record.closed_loop or channels != (1, 1):
         return []
     seen = record.until(train.stop)
     early = samples_early(seen.input, seen.output, record.dt)

@@ -29,8 +29,8 @@ DISAGREE = 5.0
 """Ratio of the errors on the hold-out to those of tuning without an alarm."""
 
 DELAYED = 2.0
-"""Largest delay margin (samples) with a note, if the plant is fitted to a record: rows
-of a record are often wrong by a sample, and a trigger may be by two."""
+"""Delay margin (samples) below which a plant fitted to a record has a note: the rows of
+a record are often wrong by a sample, and a trigger may be wrong by two."""
 
 OVERSHOOT = 1.0
 """Largest overshoot of a large step without an alarm, as a share of its height. A

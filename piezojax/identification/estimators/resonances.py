@@ -148,9 +148,10 @@ def samples_early(input: np.ndarray, output: np.ndarray, dt: float) -> float:
     """Return by how many samples ``output`` [samples] answers too soon, 0 if it is not.
 
     In a loop the output of a sample is read before the input acts, so that no delay is
-    negative. The models have no room for one and become worse: an output is early if a
-    model fits it better when it is delayed by ``LATER`` samples, with a shorter delay
-    than these. Nothing is found without a resonance.
+    negative. The models have no room for one, which biases them or makes them worse. So
+    an output is early if its delay is negative, or a model fits it much better when it
+    is delayed by ``LATER`` samples; the model of the delayed output must then have a
+    shorter delay than these. Nothing is found without a resonance.
     """
     shown, model = _found(
         np.asarray(input, float).tobytes(), np.asarray(output, float).tobytes(), dt
