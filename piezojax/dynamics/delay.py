@@ -40,9 +40,9 @@ class FractionalDelay(Fittable):
     def recipe(cls, extent: Extent) -> Recipe:
         dt = extent.dt
         found = extent.delay
-        starts = (
-            [0.5 * dt, 2.5 * dt] if found is None else [min(max(found, 0.0), 4.5 * dt)]
-        )
+        starts = [0.5 * dt, 2.5 * dt]
+        if found is not None:
+            starts = [min(max(found, 0.0), 4.5 * dt)]
         bounds = Range(0.0, 5.0 * dt)
         if found is not None and extent.modes:
             # Errors of the hysteresis would bias the delay, as they would bias a mode.
