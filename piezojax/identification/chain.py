@@ -89,7 +89,7 @@ def by_evidence(records: Sequence[Record], train: slice) -> list[Record]:
         return parts
 
     def shows(record: Record) -> tuple[bool, int, float]:
-        if (record.inputs.shape[1], record.outputs.shape[1]) != (1, 1):
+        if not record.single:
             return False, 0, record.span
         modes = dynamics_of(record).modes
         return has_steps(record.input), len(modes), record.span
@@ -105,7 +105,7 @@ def dynamics_of(record: Record) -> LinearDynamics:
 
 def shown_dynamics(records: Sequence[Record], train: slice) -> LinearDynamics:
     """Return the dynamics that the training part shows, none for several channels."""
-    if any((r.inputs.shape[1], r.outputs.shape[1]) != (1, 1) for r in records):
+    if not all(record.single for record in records):
         return LinearDynamics()
     return dynamics_of(training_record(records, train))
 

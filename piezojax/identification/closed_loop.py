@@ -277,7 +277,7 @@ def feedback_warnings(
     """
     alarms, notes = [], []
     for record in records:
-        if (record.inputs.shape[1], record.outputs.shape[1]) != (1, 1):
+        if not record.single:
             continue
         if record.closed_loop:
             notes.append(

@@ -34,7 +34,7 @@ def plausibility_warnings(record: Record) -> list[str]:
     Records of several inputs or outputs are checked for a time axis only.
     """
     clocks = [*_clocks(record)]
-    if clocks or record.inputs.shape[1] != 1 or record.outputs.shape[1] != 1:
+    if clocks or not record.single:
         return clocks
     return [*_relation(record), *_units(record)]
 
@@ -45,8 +45,7 @@ def early_warnings(record: Record, train: slice) -> list[str]:
     Only a record of one input and one output in an open loop is checked. ``train`` are
     the samples of the fit.
     """
-    channels = record.inputs.shape[1], record.outputs.shape[1]
-    if record.closed_loop or channels != (1, 1):
+    if record.closed_loop or not record.single:
         return []
     seen = record.until(train.stop)
     early = samples_early(seen.input, seen.output, record.dt)

@@ -199,11 +199,11 @@ def ranking_figure(ranking: ModelRanking) -> Figure:
     grid = picture.add_gridspec(2, 2, width_ratios=(1.15, 1.0))
     _errors_panel(picture.add_subplot(grid[:, 0]), report)
     best = list(ranking.fits.values())[:SHOWN]
-    record, outputs = best[0].record, best[0].simulations[0].shape[1]
-    single = (record.inputs.shape[1], outputs) == (1, 1)
-    if single:
+    record = best[0].record
+    if record.single:
         loop_panel(picture.add_subplot(grid[0, 1]), best[0], "chosen")
-    _residual_panel(picture.add_subplot(grid[1 if single else slice(None), 1]), best)
+    rows = 1 if record.single else slice(None)
+    _residual_panel(picture.add_subplot(grid[rows, 1]), best)
     add_title(picture, f"Models fitted to {record.source}")
     return picture
 

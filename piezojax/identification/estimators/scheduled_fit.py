@@ -67,7 +67,7 @@ def by_amplitude(
     it is fitted to the transfer matrix one sample ahead. Raises ValueError for one
     channel, for a single level, and as ``empirical_response`` and ``fit_response`` do.
     """
-    if records[0].inputs.shape[1] == 1 and records[0].outputs.shape[1] == 1:
+    if records[0].single:
         raise ValueError(
             f"{model} is for records of several inputs or outputs; these have one of "
             "each: name their columns (--input, --output)"

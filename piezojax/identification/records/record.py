@@ -128,7 +128,7 @@ class Record:
                     f"{self.source}: {name} has shape {signal.shape}; it must be "
                     f"[samples], here ({self.samples},)"
                 )
-            if self.inputs.shape[1] != 1 or self.outputs.shape[1] != 1:
+            if not self.single:
                 raise ValueError(
                     f"{self.source}: a record with a {name} must have one input and "
                     "one output"
@@ -139,6 +139,11 @@ class Record:
                     f"{self.source}: {name} is missing or not finite at sample "
                     f"{bad[0]} ({bad.size} in all)"
                 )
+
+    @property
+    def single(self) -> bool:
+        """Whether the record has one input and one output."""
+        return self.inputs.shape[1] == self.outputs.shape[1] == 1
 
     @property
     def closed_loop(self) -> bool:

@@ -134,8 +134,7 @@ def _relative(
     bound is None, and there are no errors, if all are left out, if a whole record is
     short or constant, and for records of several channels.
     """
-    channels = {(r.inputs.shape[1], r.outputs.shape[1]) for r in records}
-    if channels != {(1, 1)}:
+    if not all(record.single for record in records):
         return None, []
     errors = []
     single = [run[:, 0] for run in runs]
