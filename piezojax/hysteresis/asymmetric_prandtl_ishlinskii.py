@@ -34,7 +34,6 @@ class AsymmetricPrandtlIshlinskii(Hysteresis, Fittable):
     PrandtlIshlinskii.
     """
 
-    rest_field: ClassVar[str | None] = "rest_input"
     laws: ClassVar[Laws] = turning_point_laws()
     part: ClassVar[Part] = Part(
         "asymmetric_prandtl_ishlinskii",

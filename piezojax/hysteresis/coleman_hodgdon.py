@@ -55,7 +55,6 @@ class ColemanHodgdon(Hysteresis, Fittable):
     Raises ValueError for parameters outside their limits or an unknown scheme.
     """
 
-    rest_field: ClassVar[str | None] = "rest_input"
     laws: ClassVar[Laws] = differential_laws()
     part: ClassVar[Part] = Part(
         "coleman_hodgdon",

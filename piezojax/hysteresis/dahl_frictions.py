@@ -63,7 +63,6 @@ class DahlFrictions(Hysteresis, Fittable):
     heights, rates and exponents.
     """
 
-    rest_field: ClassVar[str | None] = "rest_input"
     laws: ClassVar[Laws] = differential_laws()
     part: ClassVar[Part] = Part(
         "dahl_frictions",

@@ -65,7 +65,6 @@ class Duhem(Hysteresis, Fittable):
     Raises ValueError for parameters outside their limits or an empty ``output``.
     """
 
-    rest_field: ClassVar[str | None] = "rest_input"
     laws: ClassVar[Laws] = differential_laws()
     part: ClassVar[Part] = Part(
         "duhem",

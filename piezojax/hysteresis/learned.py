@@ -53,7 +53,6 @@ class LearnedOperator(Hysteresis, Fittable):
     output at rest.
     """
 
-    rest_field: ClassVar[str | None] = "rest_input"
     dynamic: ClassVar[bool] = True
     part: ClassVar[Part] = Part(
         "learned_operator",

@@ -6,7 +6,7 @@ from typing import Any, ClassVar, TypeAlias
 
 import jax
 
-from ..core.arrays import Scalar, ScalarLike
+from ..core.arrays import ScalarLike
 from ..core.system import System
 from .inverse import Inverse
 
@@ -54,17 +54,14 @@ class Hysteresis(System):
 
     Input in V and output in um, unless the model says otherwise.
 
-    ``rest_field`` is the name of the field with the input before a record, or None. A
-    free run starts at rest under that input; with None it starts at rest under the
-    first input of the record. ``laws`` are the laws that the model obeys with the
-    parameters of a piezo, such as the starting values of its recipe.
+    ``laws`` are the laws that the model obeys with the parameters of a piezo, such as
+    the starting values of its recipe.
 
     ``dynamic`` is True if the output can change while the input rests: the model
     contains dynamics that cannot be separated from the hysteresis, and needs no lag
     after it.
     """
 
-    rest_field: ClassVar[str | None] = None
     dynamic: ClassVar[bool] = False
     laws: ClassVar[Laws] = {}
 
@@ -86,14 +83,3 @@ def hystereses(system: Any) -> list[Hysteresis]:
 
     parts = jax.tree.leaves(system, is_leaf=is_hysteresis)
     return [part for part in parts if is_hysteresis(part)]
-
-
-def input_before(system: Any, otherwise: ScalarLike) -> Scalar | ScalarLike:
-    """Return the input (V) before a record, from the hysteresis in ``system``.
-
-    ``otherwise`` is returned if no hysteresis has a field for it.
-    """
-    for model in hystereses(system):
-        if model.rest_field is not None:
-            return getattr(model, model.rest_field)
-    return otherwise

@@ -61,7 +61,6 @@ class NormalisedBoucWen(Hysteresis, Fittable):
     with n other than 1.
     """
 
-    rest_field: ClassVar[str | None] = "rest_input"
     laws: ClassVar[Laws] = differential_laws()
     part: ClassVar[Part] = Part(
         "normalised_bouc_wen",

@@ -33,7 +33,6 @@ class PrandtlIshlinskii(Hysteresis, Fittable):
     thresholds and weights.
     """
 
-    rest_field: ClassVar[str | None] = "rest_input"
     laws: ClassVar[Laws] = turning_point_laws()
     part: ClassVar[Part] = Part(
         "prandtl_ishlinskii",

@@ -63,7 +63,6 @@ class Preisach(Hysteresis, Designed):
     or lie above the diagonal, ``low >= high`` or an unknown start.
     """
 
-    rest_field: ClassVar[str | None] = "rest_input"
     laws: ClassVar[Laws] = turning_point_laws()
 
     weights: Matrix = parameter("um", "weights", least=0.0, converter=as_matrix)

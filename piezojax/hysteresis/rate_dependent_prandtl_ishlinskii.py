@@ -47,7 +47,6 @@ class RateDependentPrandtlIshlinskii(Hysteresis, Fittable):
     Raises ValueError in the same cases as ``PrandtlIshlinskii``.
     """
 
-    rest_field: ClassVar[str | None] = "rest_input"
     laws: ClassVar[Laws] = {"counter-clockwise": STEP}
     part: ClassVar[Part] = Part(
         "rate_dependent_prandtl_ishlinskii",

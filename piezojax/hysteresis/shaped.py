@@ -37,7 +37,6 @@ class ShapedColemanHodgdon(Hysteresis, Fittable):
     Raises ValueError for parameters outside their limits or empty polynomials.
     """
 
-    rest_field: ClassVar[str | None] = "rest_input"
     laws: ClassVar[Laws] = differential_laws()
     part: ClassVar[Part] = Part(
         "shaped_coleman_hodgdon",

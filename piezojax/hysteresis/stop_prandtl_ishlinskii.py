@@ -41,7 +41,6 @@ class StopPrandtlIshlinskii(Hysteresis, Fittable):
     thresholds and weights.
     """
 
-    rest_field: ClassVar[str | None] = "rest_input"
     laws: ClassVar[Laws] = turning_point_laws()
     part: ClassVar[Part] = Part(
         "stop_prandtl_ishlinskii",

@@ -13,6 +13,7 @@ from ..core.system import Affine, series
 from ..hysteresis.model import hystereses
 from .chain import OFFSET, by_evidence, structure
 from .closed_loop import LoopFit, is_closed, loop_fit
+from .estimators.approach import BEFORE, without_before
 from .estimators.estimate import Estimate, FittedParameter, Options, bound_warning
 from .estimators.free_runs import free_runs
 from .estimators.linear import by_frequency_response, by_subspace
@@ -94,6 +95,10 @@ def _by_output_error(
             for name, one in named.items()
         }
     runs, zeros = free_runs(system, records, train, own_starts=several)
+    system = without_before(system)
+    if BEFORE in named:
+        before = named.pop(BEFORE).model_copy(update={"standard_error": None})
+        named["input before the record"] = before
     if several:
         named |= {
             f"zero of {record.source or i}": FittedParameter(
@@ -136,6 +141,8 @@ def _optimum_warnings(
     for i, name in enumerate(fitted):
         if name not in shown:
             found += bound_warning(name, optimum.units[0, i])
+        if name == BEFORE:
+            continue  # it is no parameter of the stage
         if fitted[name].standard_error is None:
             found.append(f"{name} is not determined by this record")
         elif spread[i] > AMBIGUOUS:

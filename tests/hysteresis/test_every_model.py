@@ -36,7 +36,7 @@ from piezojax.hysteresis import (
     Preisach,
     RateDependentPreisach,
 )
-from piezojax.hysteresis.model import LAWS, hystereses, input_before
+from piezojax.hysteresis.model import LAWS, hystereses
 
 KINDS = {
     name: kind
@@ -193,4 +193,3 @@ def test_the_model_declares_known_laws(kind):
     assert set(kind.laws) <= set(LAWS)
     system = recipe_of(kind)
     assert hystereses(system) == [system]
-    assert kind.rest_field is None or float(input_before(system, np.nan)) == 0.0

@@ -130,7 +130,7 @@ def test_a_rich_record_gives_no_warning(fits):
 
 def test_the_simulation_uses_the_input_alone(fits):
     fit = fits[0]
-    before = fit.system.parts[0].rest_input
+    before = fit.report.parameters["input before the record"].value
     again = free_run(fit.system, jnp.asarray(INPUT), before)
     np.testing.assert_allclose(fit.simulated, again, rtol=0, atol=1e-10)
 
@@ -292,7 +292,8 @@ def test_a_part_without_an_end(clean, fits):
 def test_the_rest_point_is_found_or_has_a_warning(fits):
     for fit in fits:
         rest = fit.report.parameters["hysteresis.rest_input"]
-        found = abs(rest.value - REST) < 4.0 * rest.standard_error
+        deviation = rest.standard_error
+        found = deviation is not None and abs(rest.value - REST) < 4.0 * deviation
         assert found or any("rest_input" in text for text in fit.report.warnings)
 
 

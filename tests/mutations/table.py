@@ -413,6 +413,14 @@ MUTATIONS = (
         "early > EARLY",
         ("tests/identification/test_resonance.py", "-k", "early"),
     ),
+    # The input before a record
+    Mutation(
+        "a record that begins without a step, at rest somewhere else",
+        "identification/estimators/output_error.py",
+        "structure = structure.with_before(records[0].input)",
+        "structure = structure.without(())",
+        ("tests/identification/test_input_before.py",),
+    ),
     # Two searches
     Mutation(
         "a second search without the end of the first",

@@ -4,15 +4,17 @@ The last turning points determine most of the state of a hysteresis.
 """
 
 import itertools
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ...core.arrays import State
+from ...core.arrays import Scalar, ScalarLike, State, as_array
+from ...core.parameter import parameter
 from ...core.rollout import simulate
-from ...core.system import System, resolve
+from ...core.system import Series, System, resolve, series
 from ...engines import metered
 
 TURNS = 3
@@ -20,6 +22,40 @@ TURNS = 3
 
 SAMPLES = 500
 """Number of samples of the motion from one level to the next."""
+
+BEFORE = "before.voltage"
+"""Path of the input that was in force before a record, if it is fitted."""
+
+
+class Before(System):
+    """The input that was in force before a record, ``voltage`` (V).
+
+    It is a part of a chain while that is fitted to one record, and does not change its
+    input. The stage rested under this voltage, which is the first one of the record
+    unless that begins with a step.
+    """
+
+    voltage: Scalar = parameter("V", "input before the record")
+
+    def init(self, input: ScalarLike = 0.0) -> State:
+        return ()
+
+    def step(self, state: State, input: ScalarLike) -> tuple[State, Scalar]:
+        return state, as_array(input)
+
+
+def input_before(system: System, otherwise: Any) -> Any:
+    """Return the input before a record, ``otherwise`` if ``system`` has no Before."""
+    parts = system.parts if isinstance(system, Series) else ()
+    return next((part.voltage for part in parts if isinstance(part, Before)), otherwise)
+
+
+def without_before(system: System) -> System:
+    """Return ``system`` without its Before, if it has one, as a plant of any record."""
+    if not isinstance(system, Series):
+        return system
+    named = zip(system.names, system.parts, strict=True)
+    return series(**{name: p for name, p in named if not isinstance(p, Before)})
 
 
 def run_after(

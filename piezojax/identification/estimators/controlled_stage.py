@@ -10,8 +10,8 @@ from ...core.arrays import Scalar, State, as_array
 from ...core.feedback import Observation
 from ...core.rollout import simulate
 from ...core.system import System, at_rest, resolve
-from ...hysteresis.model import input_before
 from ..records.record import Record
+from .approach import input_before
 
 
 class ControlledState(NamedTuple):
@@ -27,8 +27,8 @@ class ControlledStage(System):
     """Closed loop of ``plant`` and ``controller``, without noise or limits.
 
     Input [3]: r(k) and r(k+1) (um), and the dither at k (V), which is added to the
-    command; output y(k+1) (um). The loop begins at rest under ``voltage`` (V), or under
-    the rest input of a hysteresis.
+    command; output y(k+1) (um). The loop begins with the command ``voltage`` (V), and
+    the plant at rest under it or under the input before the record.
     """
 
     plant: System

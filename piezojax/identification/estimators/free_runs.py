@@ -10,8 +10,8 @@ from jaxtyping import Array, Float
 from ...core.arrays import ScalarLike, as_array
 from ...core.rollout import simulate
 from ...core.system import System, at_rest, resolve
-from ...hysteresis.model import input_before
 from ..records.record import Record
+from .approach import input_before
 from .linear_start import Start
 from .start_search import start_of
 
@@ -31,12 +31,11 @@ def free_run(
 
 
 def from_rest(system: System, input: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
-    """Return the free run from the rest input of the model, or from the first input.
+    """Return the free run from rest under the input before it (``input_before``).
 
-    A System of several inputs starts from their first sample.
+    It is the first input by default.
     """
-    before = input_before(system, input[0]) if input.ndim == 1 else input[0]
-    return free_run(system, input, before)
+    return free_run(system, input, input_before(system, input[0]))
 
 
 def starts_of(

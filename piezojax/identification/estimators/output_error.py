@@ -121,7 +121,8 @@ def output_error(
     long record is fitted from the optimum of its first samples (``leading``), except
     for the ``own`` and ``slow`` parameters, which these do not determine. The error
     counts over the samples ``train`` of each record; the model sees the input alone,
-    from the first sample on. With several records, or with ``own_starts``, the state
+    from the first sample on, and the input before a single record is fitted with a
+    chain. With several records, or with ``own_starts``, the state
     before each record and its zero are estimated in place of the structure's ``own``
     parameters, and the ``vague`` parameters have a weak prior at the first start; its
     scale follows from the errors of a first fit without it. ``passes`` is the number of
@@ -139,6 +140,8 @@ def output_error(
     first = train if several else leading(records[0].input, train)
     if several:
         structure = structure.without(structure.own)
+    else:
+        structure = structure.with_before(records[0].input)
     starts, whitened = structure.starts, bool(structure.whitening or noise_model)
     known = first != train  # the optimum of the first samples
     if known:

@@ -5,8 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...core.space import Space, space_of
-from ...core.system import System
+from ...core.space import Range, Space, space_of
+from ...core.system import Series, System, series
+from .approach import BEFORE, Before
 
 
 class Prior(NamedTuple):
@@ -60,6 +61,27 @@ class Structure(NamedTuple):
     def order(self) -> int:
         """Number of parameters of linear dynamics."""
         return len(self.dynamics)
+
+    def with_before(self, input: np.ndarray) -> "Structure":
+        """Return the structure of a chain with the input before a record to fit.
+
+        It starts at the first ``input`` [samples] of the record, and lies at most half
+        a range from the inputs of the record, or from 0 V. Other Systems, such as whole
+        loops, have none.
+        """
+        system, low, high = self.system, float(input.min()), float(input.max())
+        if not isinstance(system, Series) or BEFORE in self.space.paths:
+            return self
+        parts = dict(zip(system.names, system.parts, strict=True))
+        margin = 0.5 * (high - low)
+        bounds = Range(min(low, 0.0) - margin, max(high, 0.0) + margin)
+        share = (input[0] - bounds.lower) / (bounds.upper - bounds.lower)
+        return self._replace(
+            system=series(before=Before(input[0]), **parts),
+            space=space_of({BEFORE: bounds, **self.space.ranges()}),
+            starts=np.insert(self.starts, 0, share, axis=1),
+            own=(BEFORE, *self.own),
+        )
 
     def without(self, paths: Collection[str]) -> "Structure":
         """Return the structure with the parameters at ``paths`` fixed."""
