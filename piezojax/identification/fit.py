@@ -22,7 +22,7 @@ from .estimators.projection import excited_columns
 from .estimators.resonances import LinearDynamics
 from .held_dynamics import HeldDynamics, combined_bound
 from .known_plant import KnownPlant
-from .methods import method_for
+from .methods import INPUT_BEFORE, ZERO, method_for
 from .plausibility import assumed_units, early_warnings, plausibility_warnings
 from .records.checks import record_warnings
 from .records.parts import check_compatible, check_train, train_and_validation
@@ -190,6 +190,16 @@ class Fit:
             unclear = any(name in unit and name not in known for name in sides)
             found[path] = "" if unclear else replaced(unit, known)
         return found
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units of the fitted parameters, and of the state before each record."""
+        zeros = [name for name in self.report.parameters if name.startswith(ZERO)]
+        return {
+            **self._parameter_units(),
+            INPUT_BEFORE: self.record.input_unit,
+            **dict.fromkeys(zeros, self.record.output_unit),
+        }
 
     @property
     def record(self) -> Record:

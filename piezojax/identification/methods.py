@@ -38,6 +38,10 @@ AMBIGUOUS = 0.01
 """Spread of a parameter among equally good fits, as a share of its range, above which
 to warn."""
 
+INPUT_BEFORE, ZERO = "input before the record", "zero of"
+"""Names of the input in force before a single record, and of the zero of the sensor in
+one of several, with the record behind it."""
+
 FITTED_AGAIN = (
     "free run from the measured input, near the known plant; biased towards -1 / "
     "controller where noise makes up most of the input"
@@ -98,10 +102,10 @@ def _by_output_error(
     system = without_before(system)
     if BEFORE in named:
         before = named.pop(BEFORE).model_copy(update={"standard_error": None})
-        named["input before the record"] = before
+        named[INPUT_BEFORE] = before
     if several:
         named |= {
-            f"zero of {record.source or i}": FittedParameter(
+            f"{ZERO} {record.source or i}": FittedParameter(
                 value=zero, standard_error=None
             )
             for i, (record, zero) in enumerate(zip(records, zeros, strict=True))

@@ -11,7 +11,7 @@ def fit_page(fit: Fit) -> Page:
     report = fit.report
     held = fit.held and bound_text(fit.about.error_bound, fit.held.dt)
     parts = [
-        fit_table(report, fit.about.parameter_units),
+        fit_table(report, fit.units),
         f"found: {report.found or 'no resonance'}",
         held,
         report.closed_loop and f"closed loop: {report.closed_loop}",

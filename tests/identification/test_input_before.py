@@ -67,6 +67,7 @@ def test_the_input_before_a_record_is_found(before):
     assert np.std(fit.errors(slice(0, 100))[0]) < 1.5 * NOISE
     assert fit.report.validation.rmse_percent_of_span < 0.1
     found = fit.report.parameters["input before the record"]
+    assert fit.units["input before the record"] == "V"
     assert found.value == pytest.approx(before, abs=1.5)
     assert not any("before" in path for path in parameters(fit.plant))
 

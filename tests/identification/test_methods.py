@@ -129,6 +129,7 @@ def test_records_of_one_stage_share_all_but_zero_and_initial_state():
     assert fit.report.validation.rmse == pytest.approx(NOISE, rel=0.2)
     zeros = [fit.report.parameters[f"zero of run {i}"].value for i in range(2)]
     assert zeros[1] - zeros[0] == pytest.approx(0.5, abs=0.01)
+    assert fit.units["zero of run 0"] == "um"
     assert "hysteresis.rest_input" not in fit.report.parameters
 
 
