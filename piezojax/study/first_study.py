@@ -142,11 +142,13 @@ offset = $offset
 duration = $duration
 settle = $settle
 
-# By default the sensitivity peak is limited to 2.0 and the delay margin to one sample,
-# for every stage within the error bound of the fitted model. Write further goals as
-# limits here: settling_time = 0.01, or, if the slew of the reference is not limited,
+# Limits for every stage within the error bound of the fitted model. By default the
+# sensitivity peak stays below 2.0. Delay margin, in samples: readings that were saved
+# one or two samples early hide as much delay. Write further goals as limits here:
+# settling_time = 0.01, or, if the slew of the reference is not limited,
 # closed_loop_peak = 1.5.
 [constraints]
+delay_margin = 2.0
 
 [optimiser]
 method = "gauss_newton"
