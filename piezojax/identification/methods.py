@@ -84,8 +84,9 @@ def _by_output_error(
         )
         found = LoopFit(optimum, optimum.system, shape, text, [])
     system, optimum, shape = found.system, found.optimum, found.shape
+    renamed = {BEFORE: INPUT_BEFORE}
     named = {
-        name.removeprefix(found.inside): FittedParameter(
+        renamed.get(name, name.removeprefix(found.inside)): FittedParameter(
             value=float(value), standard_error=error
         )
         for name, value, error in zip(
@@ -100,9 +101,10 @@ def _by_output_error(
         }
     runs, zeros = free_runs(system, records, train, own_starts=several)
     system = without_before(system)
-    if BEFORE in named:
-        before = named.pop(BEFORE).model_copy(update={"standard_error": None})
-        named[INPUT_BEFORE] = before
+    if INPUT_BEFORE in named:
+        # Only parameters of the stage have errors, from which other stages are drawn.
+        value = named.pop(INPUT_BEFORE).value
+        named[INPUT_BEFORE] = FittedParameter(value=value, standard_error=None)
     if several:
         named |= {
             f"{ZERO} {record.source or i}": FittedParameter(
@@ -145,7 +147,7 @@ def _optimum_warnings(
     for i, name in enumerate(fitted):
         if name not in shown:
             found += bound_warning(name, optimum.units[0, i])
-        if name == BEFORE:
+        if name == INPUT_BEFORE:
             continue  # it is no parameter of the stage
         if fitted[name].standard_error is None:
             found.append(f"{name} is not determined by this record")
