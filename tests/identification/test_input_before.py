@@ -82,6 +82,8 @@ def test_the_part_for_it_changes_no_output():
     assert from_rest(stage, voltages)[0] == pytest.approx(7.0)
     assert without_before(begun) == stage
     assert without_before(stage.parts[0]) == stage.parts[0]
+    unnamed = stage.parts[0] >> stage.parts[1]
+    assert without_before(unnamed) is unnamed
     assert (float(input_before(begun, 1.0)), input_before(stage, 1.0)) == (30.0, 1.0)
 
 

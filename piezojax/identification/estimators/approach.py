@@ -52,7 +52,7 @@ def input_before(system: System, otherwise: Any) -> Any:
 
 def without_before(system: System) -> System:
     """Return ``system`` without its Before, if it has one, as a plant of any record."""
-    if not isinstance(system, Series):
+    if not isinstance(system, Series) or input_before(system, None) is None:
         return system
     named = zip(system.names, system.parts, strict=True)
     return series(**{name: p for name, p in named if not isinstance(p, Before)})
