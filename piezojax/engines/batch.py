@@ -61,7 +61,11 @@ class Batch(NamedTuple):
         lanes = [
             axis for axis in axes if any(where[axis] is not None for where in values)
         ]
-        inner = [a for a in lanes if any(where[a] is not None for where in inputs)]
+        inner = [
+            axis
+            for axis in lanes
+            if sizes[axis] > 1 and any(where[axis] is not None for where in inputs)
+        ]
         inner = inner or lanes
         return cls(
             sizes,
@@ -77,18 +81,23 @@ class Batch(NamedTuple):
         directions, outer, inner = count
         return directions, outer, inner
 
+    def spread(self) -> "Batch":
+        """Return the groups with every direction as an inner lane."""
+        return self._replace(directions=[], inner=[*self.inner, *self.directions])
+
     def grouped(self, x: Any, where: Positions, *, last: bool = False) -> Array:
         """Return an operand with three batch axes, one for each group.
 
-        The axis of a group has the size 1 if the operand has no axis of this group. The
-        batch axes come first, or ``last``.
+        The axis of a group has the size 1 if the lanes of this group share the operand:
+        it has no axis of them, or only axes of a single lane. The batch axes come
+        first, or ``last``.
         """
         own = [axis for axis in range(x.ndim) if axis not in where]
         order = [axis for group in self[1:] for axis in group]
         present = [p for axis in order if (p := where[axis]) is not None]
         shape, whole, counts = [], [], []
         for group, count in zip(self[1:], self.counts, strict=True):
-            mine = any(where[axis] is not None for axis in group)
+            mine = any(where[a] is not None and self.sizes[a] > 1 for a in group)
             for axis in group:
                 size = self.sizes[axis]
                 shape.append(1 if where[axis] is None else size)

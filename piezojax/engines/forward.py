@@ -17,6 +17,7 @@ from .batch import Batch, Positions, batched, mapped, sizes_of
 from .lane_values import LaneValues
 from .metered_run import MeteredRun
 from .native_library import CompileError
+from .native_source import spreads
 
 Engine = Literal["loop", "native", "gpu", "interpreted"]
 """``loop`` is the loop of ``simulate``, ``native`` compiled C on a CPU, and ``gpu`` one
@@ -86,11 +87,18 @@ def _in_kernel(
         return None
     kernel, step = KERNELS[engine], run.step(active)
     count, first = sum(run.counts), sum(run.counts[:2])
-    by_lane = any(p is not None for each in positions[first:count] for p in each)
+    sizes = sizes_of(operands, positions)
+    by_lane = any(
+        place is not None and size > 1
+        for each in positions[first:count]
+        for place, size in zip(each, sizes, strict=True)
+    )
     if step is None or not kernel.computes(step, by_lane):
         return None
-    sizes = sizes_of(operands, positions)
     batch = Batch.sorted(sizes, positions[:count], positions[first:count])
+    # Inputs by lane are copied for each direction: this takes the memory of a full log.
+    if spreads(step, batch.counts) and (run.every == 1 or not by_lane):
+        batch = batch.spread()
     pairs = [*zip(operands, positions, strict=True)]
     grouped = [batch.grouped(x, where) for x, where in (*pairs[:first], *pairs[count:])]
     inputs = [batch.grouped(x, where, last=True) for x, where in pairs[first:count]]

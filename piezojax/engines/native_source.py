@@ -1,5 +1,6 @@
 """C source of a run of many lanes, whose inner loops become SIMD instructions."""
 
+import math
 from collections.abc import Iterable, Sequence
 from string import Template
 from typing import NamedTuple
@@ -55,6 +56,18 @@ def shape_for(step: ScalarStep, lanes: int, every: int, segment: int = 0) -> Sha
 def waits(step: ScalarStep, lanes: int) -> bool:
     """Return whether a run without derivatives mostly waits for its own results."""
     return lanes <= GROUP and len(step.moving) < SHORT and not step.slopes
+
+
+def spreads(step: ScalarStep, counts: tuple[int, int, int]) -> bool:
+    """Return whether derivatives run faster with each direction as a lane of its own.
+
+    ``counts`` are the numbers of directions, outer and inner lanes. A lane of its own
+    repeats the values of the step, but leaves no place in a group of lanes empty.
+    """
+    directions, _, inner = counts
+    values, slopes = len(step.moving), len(step.moving_slopes)
+    together = math.ceil(inner / GROUP) * (values + directions * slopes)
+    return math.ceil(directions * inner / GROUP) * (values + slopes) < together
 
 
 def has_source(step: ScalarStep) -> bool:

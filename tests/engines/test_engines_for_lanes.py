@@ -286,12 +286,14 @@ def test_loops_on_a_gpu(name, in_registers, monkeypatch):
 
 
 @needs_compiler
-@pytest.mark.parametrize("every", [0, 1, 5])
-def test_each_lane_and_draw_has_its_inputs(every):
+@pytest.mark.parametrize(
+    ("every", "paths", "draws"), [(0, 2, 3), (1, 2, 3), (5, 2, 3), (1, 1, 3), (5, 1, 1)]
+)
+def test_each_lane_and_draw_has_its_inputs(every, paths, draws):
     """Axes of plants, references and draws, in any order, with time first or last."""
     rng = np.random.default_rng(7)
-    references = jnp.array(rng.uniform(0.0, 5.0, (SAMPLES, 2)))
-    noise = jnp.array(rng.standard_normal((3, SAMPLES, 2)))
+    references = jnp.array(rng.uniform(0.0, 5.0, (SAMPLES, paths)))
+    noise = jnp.array(rng.standard_normal((draws, SAMPLES, paths)))
     loop = p753.loop(p753.disturbance_observer())
 
     def error(sample):
@@ -310,18 +312,18 @@ def test_each_lane_and_draw_has_its_inputs(every):
                 engine=engine,
             )
 
-        draws = jax.vmap(one, (None, None, 0))
-        runs = jax.vmap(draws, (None, 1, 2))
+        each_draw = jax.vmap(one, (None, None, 0))
+        runs = jax.vmap(each_draw, (None, 1, 2))
         return jax.vmap(runs, (0, None, None))(cutoffs, references, noise)
 
     values = spread(4, 900.0)
     figures, log = assert_engine_equals_loop("native", simulated, values)
     assert {*figures} == {"rms_error", "peak_voltage"}
-    assert figures["rms_error"].shape == (4, 2, 3)
-    assert len({*np.asarray(figures["rms_error"]).ravel()}) == 24
+    assert figures["rms_error"].shape == (4, paths, draws)
+    assert len({*np.asarray(figures["rms_error"]).ravel()}) == 4 * paths * draws
     assert (log is None) == (every == 0)
     if every:
-        assert log.shape == (4, 2, 3, SAMPLES // every)
+        assert log.shape == (4, paths, draws, SAMPLES // every)
 
     def slopes(values, engine):
         """Return derivatives for all cut-offs and for each alone."""
@@ -359,6 +361,40 @@ def test_derivatives_by_gain_start_and_inputs(places, kernels):
         assert_equal(program(*parts, "native"), program(*parts, "loop"))
     forward = lowered(lambda *p: jax.jacfwd(total, places)(*p, "native"), *parts)
     assert forward.count("custom_call @piezojax_") == kernels
+
+
+@needs_compiler
+@pytest.mark.parametrize("own_inputs", [True, False])
+@pytest.mark.parametrize("every", [1, 5])
+@pytest.mark.parametrize(("lanes", "spread_out"), [(1, True), (2, True), (8, False)])
+def test_directions_become_lanes_where_lanes_are_few(
+    lanes, spread_out, every, own_inputs, monkeypatch
+):
+    """Except for a log of few samples: inputs of each lane are not copied for it."""
+    inputs = driven() + jnp.arange(float(lanes))[:, None]
+
+    def outputs(weights, input, engine):
+        plays = PrandtlIshlinskii(
+            polynomial=[0.0, 0.1], thresholds=jnp.arange(1.0, 13.0), weights=weights
+        )
+        system = plays >> FirstOrderLag(3e-4, p753.DT)
+        run = system, input, system.init(2.0)
+        return metered(*run, log=lambda y: y, every=every, engine=engine)[1]
+
+    def jacobians(weights, engine):
+        slopes = jax.jacfwd(partial(outputs, engine=engine))
+        if own_inputs:
+            return jax.vmap(slopes)(weights, inputs)
+        return jax.vmap(slopes, (0, None))(weights, inputs[0])
+
+    seen, spread_of = [], forward.Batch.spread
+    monkeypatch.setattr(
+        forward.Batch, "spread", lambda batch: seen.append(batch) or spread_of(batch)
+    )
+    weights = jnp.linspace(0.001, 0.01, lanes * 12).reshape(lanes, 12)
+    assert_engine_equals_loop("native", jacobians, weights)
+    copied = own_inputs and lanes > 1
+    assert bool(seen) == (spread_out and (every == 1 or not copied))
 
 
 @pytest.mark.parametrize("engine", ENGINES)

@@ -27,7 +27,7 @@ from ...core.arrays import Scalar, ScalarLike, State, as_array
 from ...core.feedback import Feedback
 from ...core.system import System
 from ...dynamics.linearise import linearise, split_static
-from ...engines import metered
+from ...engines import run_outputs
 from .broken_loop import BrokenLoop, BrokenState, cut, open_loop
 from .operating_point import BRANCHES, OperatingPoint
 
@@ -203,7 +203,7 @@ def _impulse(
 
 def _run(motion: SmallMotion, inputs: Any) -> Float[Array, " samples"]:
     """Return the output of a small motion at each sample."""
-    return metered(motion, inputs, motion.init(), log=lambda output: output)[1]
+    return run_outputs(motion, inputs, motion.init())
 
 
 def _axes_impulse(

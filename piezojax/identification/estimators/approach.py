@@ -4,6 +4,7 @@ The last turning points determine most of the state of a hysteresis.
 """
 
 import itertools
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -15,7 +16,7 @@ from ...core.arrays import Scalar, ScalarLike, State, as_array
 from ...core.parameter import parameter
 from ...core.rollout import simulate
 from ...core.system import Series, System, resolve, series
-from ...engines import metered
+from ...engines import run_outputs
 
 TURNS = 3
 """Number of levels of the motion before a record."""
@@ -69,8 +70,10 @@ def run_after(
     the first input. A plant maps u(k) to y(k+1), as in ``free_run``. A plant of scalar
     signals takes [samples] and [turns], and returns [samples].
     """
-    system = resolve(system)  # once for the motion and the run
-    return run_from(system, inputs, state_after(system, inputs[0], levels))
+    system = resolve(system)  # once for the start and the run
+    path = jnp.concatenate([*_motion(inputs[0], levels), inputs[:1], inputs])
+    outputs = run_outputs(system, path, system.init(levels[0]))
+    return outputs[TURNS * SAMPLES : -1]
 
 
 def state_after(system: System, first: Array, levels: Array) -> State:
@@ -89,8 +92,7 @@ def _motion(first: Array, levels: Array) -> list[Array]:
 
 def run_from(system: System, inputs: Array, state: State) -> Array:
     """Return the outputs from ``state``, which is one sample before the record."""
-    _, outputs = simulate(system, jnp.concatenate([inputs[:1], inputs]), state)
-    return outputs[:-1]
+    return run_outputs(system, jnp.concatenate([inputs[:1], inputs]), state)[:-1]
 
 
 @eqx.filter_jit
@@ -100,12 +102,4 @@ def runs_after(
     levels: Float[Array, " candidates turns *m"],
 ) -> Array:
     """Return the outputs of ``run_after`` for each candidate of ``levels``."""
-    system = resolve(system)
-
-    def run(turns: Array) -> Array:
-        path = _motion(inputs[0], turns)
-        every = jnp.concatenate([*path, inputs[:1], inputs])
-        _, outputs = metered(system, every, system.init(turns[0]), log=lambda y: y)
-        return outputs[TURNS * SAMPLES : -1]
-
-    return jax.vmap(run)(levels)
+    return jax.vmap(partial(run_after, resolve(system), inputs))(levels)

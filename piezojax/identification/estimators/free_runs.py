@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ...core.arrays import ScalarLike, as_array
-from ...core.rollout import simulate
 from ...core.system import System, at_rest, resolve
+from ...engines import run_outputs
 from ..records.record import Record
 from .approach import input_before
 from .linear_start import Start
@@ -26,8 +26,7 @@ def free_run(
     """
     system = resolve(system)  # once for the start and the run
     state, first = at_rest(system, before)
-    _, outputs = simulate(system, input, state)
-    return jnp.concatenate([first[None], outputs[:-1]])
+    return jnp.concatenate([first[None], run_outputs(system, input, state)[:-1]])
 
 
 def from_rest(system: System, input: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
