@@ -146,5 +146,6 @@ class HeldLinear(System):
         self, state: Float[Array, " n"], input: ScalarLike
     ) -> tuple[Float[Array, " n"], Scalar]:
         rest = self.rest * as_array(input)
-        state = rest + self.transition @ (state - rest)
-        return state, self.output @ state
+        # Sums, because XLA calls a kernel for each product of matrices in a loop.
+        state = rest + jnp.sum(self.transition * (state - rest), axis=1)
+        return state, jnp.sum(self.output * state)

@@ -41,6 +41,20 @@ MUTATIONS = (
         (_ENGINES, "-k", "number_of_lanes"),
     ),
     Mutation(
+        "inputs of a single lane in the shape of all lanes",
+        "engines/batch.py",
+        "mine = any(where[a] is not None and self.sizes[a] > 1 for a in group)",
+        "mine = any(where[a] is not None for a in group)",
+        (_ENGINES, "-k", "its_inputs"),
+    ),
+    Mutation(
+        "directions that stay in turn where lanes are few",
+        "engines/native_source.py",
+        "math.ceil(directions * inner / GROUP) * (values + slopes) < together",
+        "math.ceil(directions * inner / GROUP) * (values + slopes) < 0 * together",
+        (_ENGINES, "-k", "become_lanes"),
+    ),
+    Mutation(
         "a sum of few lanes with the sign of an inner term",
         "engines/shorter_chain.py",
         "Term(outer.sign * inner.sign, factor, inner.node)",
