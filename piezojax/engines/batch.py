@@ -36,8 +36,9 @@ def batched(positions: Positions, axis: int | None) -> Positions:
 class Batch(NamedTuple):
     """Batch axes of a run in three groups.
 
-    ``directions`` are the axes that only tangents have, ``inner`` the axes that inputs
-    have, and ``outer`` the others. If inputs have none, the others are inner.
+    ``directions`` are the axes that only tangents have, ``inner`` the axes of several
+    lanes that inputs have, and ``outer`` the others. If inputs have none, the others
+    are inner.
     """
 
     sizes: tuple[int, ...]
