@@ -33,6 +33,17 @@ def batched(positions: Positions, axis: int | None) -> Positions:
     return axis, *moved
 
 
+def axes_with_lanes(
+    sizes: tuple[int, ...], positions: Sequence[Positions]
+) -> list[int]:
+    """Return the batch axes of several lanes that any of the operands has."""
+    return [
+        axis
+        for axis, size in enumerate(sizes)
+        if size > 1 and any(where[axis] is not None for where in positions)
+    ]
+
+
 class Batch(NamedTuple):
     """Batch axes of a run in three groups.
 
@@ -62,12 +73,7 @@ class Batch(NamedTuple):
         lanes = [
             axis for axis in axes if any(where[axis] is not None for where in values)
         ]
-        inner = [
-            axis
-            for axis in lanes
-            if sizes[axis] > 1 and any(where[axis] is not None for where in inputs)
-        ]
-        inner = inner or lanes
+        inner = axes_with_lanes(sizes, inputs) or lanes
         return cls(
             sizes,
             [axis for axis in axes if axis not in lanes],

@@ -13,7 +13,7 @@ from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
 from . import gpu_kernel, native_kernel
-from .batch import Batch, Positions, batched, mapped, sizes_of
+from .batch import Batch, Positions, axes_with_lanes, batched, mapped, sizes_of
 from .lane_values import LaneValues
 from .metered_run import MeteredRun
 from .native_library import CompileError
@@ -88,11 +88,7 @@ def _in_kernel(
     kernel, step = KERNELS[engine], run.step(active)
     count, first = sum(run.counts), sum(run.counts[:2])
     sizes = sizes_of(operands, positions)
-    by_lane = any(
-        place is not None and size > 1
-        for each in positions[first:count]
-        for place, size in zip(each, sizes, strict=True)
-    )
+    by_lane = bool(axes_with_lanes(sizes, positions[first:count]))
     if step is None or not kernel.computes(step, by_lane):
         return None
     batch = Batch.sorted(sizes, positions[:count], positions[first:count])

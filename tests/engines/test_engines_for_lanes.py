@@ -286,7 +286,9 @@ def test_loops_on_a_gpu(name, in_registers, monkeypatch):
 
 
 @needs_compiler
-@pytest.mark.parametrize(("every", "paths", "draws"), [(0, 1, 1), (1, 2, 3), (5, 1, 3)])
+@pytest.mark.parametrize(
+    ("every", "paths", "draws"), [(0, 2, 3), (1, 2, 3), (5, 2, 3), (5, 1, 3)]
+)
 def test_each_lane_and_draw_has_its_inputs(every, paths, draws):
     """Axes of plants, references and draws, in any order, with time first or last."""
     rng = np.random.default_rng(7)
