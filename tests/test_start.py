@@ -188,7 +188,11 @@ def test_answers_replace_defaults(record):
     assert found.upper == 50.0
     fastest = 0.5 * found.amplitude * 2.0 * np.pi * 28.0
     assert found.slew > fastest
-    assert planned(loaded, {"slew": 3.0}).slew == 3.0
+    # That of a cosine, and of the turns of the unseen SCAN, which take a tenth of it.
+    cosine = fastest * 2.0 * np.pi * 28.0
+    assert cosine < found.acceleration < 1e2 * cosine
+    limited = planned(loaded, {"slew": 3.0, "acceleration": 5.0})
+    assert (limited.slew, limited.acceleration) == (3.0, 5.0)
 
 
 @pytest.mark.parametrize(
@@ -197,6 +201,7 @@ def test_answers_replace_defaults(record):
         ({"frequency": 0.0}, "frequency is 0 Hz; it must be above 0"),
         ({"amplitude": -1.0}, "amplitude is -1 um; it must be above 0"),
         ({"slew": 0.0}, "slew is 0 um/s; it must be above 0"),
+        ({"acceleration": -2.0}, "acceleration is -2 um/s"),
         ({"noise": -0.1}, "noise is -0.1 um; it must be at least 0"),
         ({"noise": np.nan}, "noise is nan; it must be a number"),
         (
@@ -258,7 +263,9 @@ def test_a_record_that_was_smoothed_is_doubted(record):
 
 
 def test_the_study_holds_the_answers_and_fits_the_record(record, tmp_path):
-    plan = Plan(0.0, 80.0, 0.02, 2.0, "SIN2, SCAN4", 1.0, 2.0, 50.0, "inversion_pid")
+    plan = Plan(
+        0.0, 80.0, 0.02, 2.0, "SIN2, SCAN4", 1.0, 2.0, 50.0, 4e3, "inversion_pid"
+    )
     columns = {"time": "time_s", "input": "command_V", "output": "sensor_um"}
     plant = plant_of_record(record, columns, tmp_path, model="lag")
     text = first_study(plan, plant, 1e3, seed=4)
@@ -280,7 +287,8 @@ def test_the_study_holds_the_answers_and_fits_the_record(record, tmp_path):
     case = build(study, path, progress=progress)
     assert case.fit.record.source == "record.csv"
     assert "controller.controller.feedback.integral" in case.space.paths
-    assert case.loop.controller.slew == 50.0
+    limited = case.loop.controller
+    assert (limited.slew, limited.acceleration) == (50.0, 4e3)
     # The fit of the plant reports its progress.
     assert any(text.startswith("fitting from") for text in stages)
 
@@ -357,7 +365,7 @@ def test_the_study_of_a_response_fits_it(tmp_path):
 
 
 DEVICE_PLAN = Plan(
-    0.0, 80.0, 0.02, 2.0, "SIN2", 1.0, 2.0, 50.0, "nv200", 5.0, -1.0, 9.0
+    0.0, 80.0, 0.02, 2.0, "SIN2", 1.0, 2.0, 50.0, 4e3, "nv200", 5.0, -1.0, 9.0
 )
 
 
@@ -411,7 +419,7 @@ def test_a_device_without_a_scale_is_doubted_or_refused(record, tmp_path):
 
 @pytest.mark.parametrize("title", ['"quoted" \\ back', "um ä µ"])
 def test_names_of_files_are_quoted(tmp_path, title):
-    plan = Plan(0.0, 80.0, 0.02, 2.0, "SIN2", 1.0, 2.0, 50.0)
+    plan = Plan(0.0, 80.0, 0.02, 2.0, "SIN2", 1.0, 2.0, 50.0, 4e3)
     text = first_study(plan, plant_of_record(tmp_path / title, {}, tmp_path), 1e3)
     assert tomllib.loads(text)["plant"]["record"] == title
 
@@ -515,7 +523,7 @@ def test_other_controllers_have_no_questions_of_devices(run):
 
 
 def test_answers_are_asked_for_with_defaults(run, tmp_path):
-    answers = "\n80\n900\n\n3\n\n0.5\n\n70\ninversion_pid\n"
+    answers = "\n80\n900\n\n3\n\n0.5\n\n70\ninversion_pid\n8000\n"
     status, output, _ = run(answers=answers)
     assert status == 0, output
     assert "references to track, with their frequencies in Hz [SIN3,PWSW12]:" in output
@@ -527,13 +535,14 @@ def test_answers_are_asked_for_with_defaults(run, tmp_path):
     assert study.controller == {
         "type": "LimitedReference",
         "slew": 70.0,
+        "acceleration": 8000.0,
         "dt": 1e-3,
         "controller": {"design": "inversion_pid"},
     }
 
 
 def test_a_question_is_asked_again_after_a_refused_answer(run, tmp_path):
-    answers = "\n0\n80\n\n\n3\nSIN\n\n0.5\n\n\n\n"
+    answers = "\n0\n80\n\n\n3\nSIN\n\n0.5\n\n\n\n\n"
     status, output, _ = run(answers=answers)
     assert status == 0, output
     assert "upper 0 V; lower must be below upper\nupper limit of" in output

@@ -43,14 +43,18 @@ QUESTIONS = {
     "controller": Question(
         "controller to tune", str, ", such as inversion_pid or nv200"
     ),
+    "acceleration": Question(
+        "largest acceleration that the controller follows; the ramps start and end "
+        "with it [um/s^2]"
+    ),
     "scale": Question("scale of the gains of the device, 0 if unknown [V/um]"),
     "lowest": Question("lowest position of the device's range [um]"),
     "highest": Question("highest position of the device's range [um]"),
 }
 """The questions by the name of their option; ``planned`` gives the defaults."""
 
-OF_DEVICES = ("scale", "lowest", "highest")
-"""Questions that only concern the controller of a vendor's device."""
+OF_DEVICES = {"scale": True, "lowest": True, "highest": True, "acceleration": False}
+"""Questions that concern only the controllers of devices (True), or only the others."""
 
 
 def questions(function: Callable) -> Callable:
@@ -114,4 +118,5 @@ def concerns(name: str, plan: "Plan") -> bool:
     from ..study.first_plan import DEVICES
 
     known = getattr(plan, name) is not None
-    return known and (name not in OF_DEVICES or plan.controller in DEVICES)
+    device = plan.controller in DEVICES
+    return known and OF_DEVICES.get(name, device) == device

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 
 from ..scalar.graph import INPUT, Graph
 from ..scalar.memory import NotScalarError
-from ..scalar.trace import trace
 from .scalar_step import (
     FIRST_VALUE,
     INDEX,
@@ -19,6 +18,7 @@ from .scalar_step import (
     nodes_by_place,
     places_of,
     sorted_step,
+    unrolled,
     vanishing,
 )
 
@@ -54,7 +54,9 @@ def adjoint_step(
     function = _with_reverse_pass(step, system, carry)
     try:
         with jax.ensure_compile_time_eval():
-            graph, results = trace(function, *parts, INDEX, [*states], [*numbers], log)
+            graph, results = unrolled(
+                function, *parts, INDEX, [*states], [*numbers], log
+            )
     except NotScalarError:
         raise
     except (TypeError, ValueError, NotImplementedError) as error:

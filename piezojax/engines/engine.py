@@ -62,8 +62,9 @@ def metered(
     reverse mode only inside the context ``reverse_mode``. The following run in the loop
     of ``simulate`` instead, with the same result:
 
-    - a step without a scalar form (see ``trace``), with a loop inside, with too many
-      operations, or with an operation that the engine lacks;
+    - a step without a scalar form (see ``trace``), with a loop inside that has no fixed
+      number of repetitions, with too many operations, or with an operation that the
+      engine lacks;
     - second derivatives, and derivatives with respect to inputs;
     - in reverse mode, a log with ``every`` above 1;
     - on a GPU, a log, derivatives, and inputs that differ between lanes.

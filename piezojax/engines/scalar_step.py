@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Collection, Iterable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -11,6 +12,9 @@ import numpy as np
 from ..scalar.graph import CONSTANT, INPUT, Graph
 from ..scalar.memory import NotScalarError
 from ..scalar.trace import LONG, trace
+
+unrolled = partial(trace, rolled=math.inf)
+"""Trace without loops of a fixed number of repetitions: kernels have straight code."""
 
 INDEX = jax.ShapeDtypeStruct((), jnp.int32)
 """Type of the number of a sample."""
@@ -128,7 +132,7 @@ def scalar_step(
     else:
         function, more = step, []
     with jax.ensure_compile_time_eval():
-        graph, results = trace(function, *parts, INDEX, *more)
+        graph, results = unrolled(function, *parts, INDEX, *more)
     leaves, half = len(parts[1]), len(results) // 2 if active else len(results)
     after = nodes_by_place("carry", enumerate(results[:leaves]))
     slopes = nodes_by_place(

@@ -48,8 +48,9 @@ def advance_stops(change: Scalar, memory: Memory, thresholds: Memory) -> Memory:
 
 def _limited(value: Scalar, low: Scalar, high: Scalar) -> Scalar:
     # jnp.maximum divides its gradient between equal arguments, which takes twice as
-    # long.
-    return jnp.where(value < low, low, jnp.where(value > high, high, value))
+    # long; jnp.where takes twice as long to trace.
+    inside = jax.lax.select(value > high, high, value)
+    return jax.lax.select(value < low, low, inside)
 
 
 def check_plays(thresholds: Memory, weights: Memory, name: str = "weights") -> None:

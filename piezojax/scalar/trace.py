@@ -76,19 +76,22 @@ MOST = 15_000
 """Largest number of nodes of a graph; C compilers take minutes for more."""
 
 
-def trace(function: Callable, *arguments: Any) -> tuple[Graph, list[Any]]:
+def trace(
+    function: Callable, *arguments: Any, rolled: float = ROLLED
+) -> tuple[Graph, list[Any]]:
     """Return the graph of ``function`` and the nodes of its outputs, leaf by leaf.
 
     The place of an input is its index among all elements of the leaves of
-    ``arguments``. Raises NotScalarError for an operation without a scalar form, and for
-    more than ``MOST`` nodes.
+    ``arguments``. A scan without rows and of at least ``rolled`` repetitions remains a
+    loop; other scans are unrolled. Raises NotScalarError for an operation without a
+    scalar form, and for more than ``MOST`` nodes.
     """
     closed: Any = jax.make_jaxpr(function)(*arguments)
     # Solvers use primitives of Equinox that exist only as Python implementations.
     # Equinox replaces them here, but raises TypeError for some inside a derivative.
     with suppress(TypeError):
         closed = eqxi.finalise_jaxpr(closed)
-    tracer = _Tracer()
+    tracer = _Tracer(rolled)
     place = 0
     inputs = []
     for variable in closed.jaxpr.invars:
@@ -108,7 +111,8 @@ def trace(function: Callable, *arguments: Any) -> tuple[Graph, list[Any]]:
 
 
 class _Tracer:
-    def __init__(self):
+    def __init__(self, rolled: float):
+        self.rolled = rolled
         self.graph = Graph()
         self.arrays = NodeArrays(self.graph)
 
@@ -262,15 +266,12 @@ class _Tracer:
         return found
 
     def scan(self, params: Any, operands: list[Numbers]) -> list[Numbers]:
-        """Return the results of a scan, which is unrolled.
-
-        A scan without rows in or out remains a loop in C if it is not short.
-        """
+        """Return the results of a scan, unrolled or as a loop."""
         consts, count = params["num_consts"], params["num_carry"]
         shared, carry = operands[:consts], operands[consts : consts + count]
         rows = operands[consts + count :]
         closed, length = params["jaxpr"], params["length"]
-        if not rows and len(closed.jaxpr.outvars) == count and length >= ROLLED:
+        if not rows and len(closed.jaxpr.outvars) == count and length >= self.rolled:
             return self._repeated(closed, shared, carry, length)
         order = range(length)
         collected: list[list[Numbers]] = []

@@ -25,7 +25,8 @@ PERIODS = 3
 """Periods of the slowest reference in a run; the first does not count."""
 
 FASTER = 1.2
-"""Default limit of the slew, relative to the largest slew of the references."""
+"""Default limits of slew and acceleration, relative to the largest of the references.
+"""
 
 RECORDED = 0.7
 """Largest slew of the default references, as a share of that of the record, with the
@@ -56,6 +57,13 @@ MEASURE = (
     "error and voltage, docs/devices.md) and give it as --scale"
 )
 """How the scale of a device's gains is found; its name is left out."""
+
+_POSITIVE = {
+    "frequency": "Hz",
+    "amplitude": "um",
+    "slew": "um/s",
+    "acceleration": "um/s^2",
+}
 
 _CONSTANT = ("STEP", "CONST")
 """References without a frequency."""
@@ -124,9 +132,10 @@ class Plan:
     ``lower`` and ``upper`` are the limits of the voltage, ``noise`` is the rms noise of
     the sensor, ``track`` names the references to tune on, as "SIN10,PWSW40", and
     ``frequency`` is that of the slowest one. The references cover ``offset`` to
-    ``offset + 2 amplitude``. The controller follows at most the slew ``slew``, um/s: it
-    sees faster references, such as jumps, as ramps. ``controller`` is the name of a
-    design. For a device, ``scale`` is that of its gains (V/um; 0 if it is unknown and
+    ``offset + 2 amplitude``. The controller follows at most the slew ``slew``, um/s,
+    and the acceleration ``acceleration``, um/s^2: it sees faster references, such as
+    jumps, as smooth motions. ``controller`` is the name of a design. A device limits
+    the slew alone; for it, ``scale`` is that of its gains (V/um; 0 if it is unknown and
     to be assumed), and its positions range from ``lowest`` to ``highest``.
     ``slew_rate`` is the largest one of the voltage, V/s; 0 is no limit.
     ``hysteresis`` is the relative width of the loop that the stage is assumed to have
@@ -142,6 +151,7 @@ class Plan:
     amplitude: float
     offset: float
     slew: float
+    acceleration: float
     controller: str = "inversion_sliding_mode"
     scale: float = 0.0
     lowest: float = 0.0
@@ -155,7 +165,7 @@ class Plan:
             value = getattr(self, field.name)
             if field.type is float and not np.isfinite(value):
                 raise ValueError(f"{field.name} is {value}; it must be a number")
-        for name, unit in (("frequency", "Hz"), ("amplitude", "um"), ("slew", "um/s")):
+        for name, unit in _POSITIVE.items():
             if getattr(self, name) <= 0.0:
                 raise ValueError(
                     f"{name} is {getattr(self, name):g} {unit}; it must be above 0"
@@ -202,8 +212,8 @@ def planned(shown: Shown, given: dict[str, Any]) -> Plan:
     lowest and highest voltage, and the references lie around the middle of the
     displacements. The slowest has at least ``SAMPLES_A_PERIOD`` samples in a period,
     and needs at most ``RECORDED`` times the largest slew that is shown, which limits
-    that of the voltage. The limit of the slew of the references is ``FASTER`` times
-    their largest one.
+    that of the voltage. The limits of slew and acceleration of the references are
+    ``FASTER`` times their largest ones.
 
     Raises ValueError as ``Plan`` does, and for references outside the displacements.
     """
@@ -220,7 +230,8 @@ def planned(shown: Shown, given: dict[str, Any]) -> Plan:
             "track": f"SIN{frequency:g},PWSW{4.0 * frequency:g}",
             "amplitude": amplitude,
             "offset": _rounded(0.5 * (low + high) - amplitude),
-            "slew": 1.0,  # until the references are known
+            "slew": 1.0,  # this and the next until the references are known
+            "acceleration": 1.0,
             "lowest": _rounded(low),
             "highest": _rounded(high),
             "slew_rate": _rounded(shown.slew or 0.0),
@@ -233,11 +244,14 @@ def planned(shown: Shown, given: dict[str, Any]) -> Plan:
     if "frequency" not in known and shown.slew is not None:
         gain = (high - low) / (shown.inputs[1] - shown.inputs[0])
         recorded = RECORDED * shown.slew * gain
-        fastest = FASTER * _fastest(plan, shown.dt)
+        fastest, _ = _limits(plan, shown.dt)
         if fastest > recorded:
             plan = plan_of(_round_below(plan.frequency * recorded / fastest))
-    if "slew" not in known:
-        plan = replace(plan, slew=_rounded(FASTER * _fastest(plan, shown.dt)))
+    slew, acceleration = (_rounded(limit) for limit in _limits(plan, shown.dt))
+    suggested = {"slew": slew, "acceleration": acceleration}
+    plan = replace(
+        plan, **{name: v for name, v in suggested.items() if name not in known}
+    )
     least, most = plan.offset, plan.offset + 2.0 * plan.amplitude
     beyond = BEYOND * (high - low)
     if least < low - beyond or most > high + beyond:
@@ -249,14 +263,20 @@ def planned(shown: Shown, given: dict[str, Any]) -> Plan:
     return plan
 
 
-def _fastest(plan: Plan, dt: float) -> float:
-    """Return the largest slew of the references of ``plan``, um/s; ``dt`` in s."""
+def _limits(plan: Plan, dt: float) -> tuple[float, float]:
+    """Return the limits of slew (um/s) and acceleration (um/s^2) of the references.
+
+    They are ``FASTER`` times the largest ones of ``plan``; ``dt`` in s.
+    """
     time = time_grid(PERIODS / plan.frequency, 1.0 / dt)
-    return max(
-        float(np.abs(np.diff(signal(name, time, plan.amplitude, plan.offset))).max())
-        / dt
-        for name in (*plan.tracked, *plan.unseen)
-    )
+    names = (*plan.tracked, *plan.unseen)
+    runs = [signal(name, time, plan.amplitude, plan.offset) for name in names]
+
+    def limit(order: int) -> float:
+        largest = max(float(np.abs(np.diff(run, order)).max()) for run in runs)
+        return FASTER * largest / dt**order
+
+    return limit(1), limit(2)
 
 
 def doubts(plan: Plan, shown: Shown) -> list[str]:

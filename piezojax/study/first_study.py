@@ -159,12 +159,13 @@ steps = 80
 
 
 _LIMITED = Template("""\
-# The controller follows references up to this slew, um/s. It sees faster ones, such as
-# jumps, as ramps, because a jump excites the modes of the stage through the
-# feedforward. dt is 1 / rate.
+# The controller follows references up to this slew, um/s, and this acceleration,
+# um/s^2. It sees faster ones, such as jumps, as smooth motions within these limits,
+# because a jump excites the modes of the stage through the feedforward. dt is 1 / rate.
 [controller]
 type = "LimitedReference"
 slew = $slew
+acceleration = $acceleration
 dt = $dt
 
 # This design gives the controller and its gains before tuning.
@@ -226,7 +227,7 @@ def _parameters(controller: str) -> str:
 
 def _controller(plan: Plan, dt: float) -> str:
     """Return the tables of the controller as TOML; ``dt`` in s."""
-    names = ("controller", "slew", "scale")
+    names = ("controller", "slew", "acceleration", "scale")
     values = {name: _toml(getattr(plan, name)) for name in names}
     if plan.controller not in DEVICES:
         return _LIMITED.substitute(values, dt=_toml(dt))

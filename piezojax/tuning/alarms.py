@@ -84,7 +84,7 @@ def peak_notes(stability: StabilityReports) -> list[str]:
     return [
         f"the tuned loop amplifies references at {worst.closed_loop_peak_Hz:.4g} Hz by "
         f"{worst.closed_loop_peak:.3g}: filter references that contain this frequency, "
-        "such as steps, or limit constraints.closed_loop_peak"
+        "as jumps do, or limit constraints.closed_loop_peak"
     ]
 
 
@@ -278,8 +278,8 @@ def _step_alarms(steps: Mapping[str, StepResult]) -> Iterable[str]:
     reached = f"overshoots by {100.0 * worst:.3g} %" if known else "diverges"
     yield (
         f"a step of the reference from {step.before_um:.4g} to {step.after_um:.4g} um "
-        f"{reached}: limit the slew of the reference (LimitedReference) or lower its "
-        "slew, or limit constraints.closed_loop_peak"
+        f"{reached}: limit slew and acceleration of the reference (LimitedReference), "
+        "lower these limits, or limit constraints.closed_loop_peak"
     )
 
 

@@ -1,5 +1,7 @@
 """Many lanes in one kernel, against the loop of ``simulate``."""
 
+import subprocess
+import sys
 from functools import partial
 
 import jax
@@ -12,6 +14,7 @@ from jax.errors import JaxRuntimeError
 
 import piezojax as pj
 from piezojax.catalog import p753
+from piezojax.control import FeedforwardFeedback
 from piezojax.core.arrays import as_array
 from piezojax.core.feedback import Feedback, LoopInput
 from piezojax.core.metrics import Chosen, Tracking
@@ -25,11 +28,12 @@ from piezojax.engines import (
     gpu_kernel,
     lane_values,
     metered,
+    native_kernel,
     reverse_mode,
 )
 from piezojax.engines import native_library as library
 from piezojax.hardware import Quantiser, Saturation, Sensor
-from piezojax.hysteresis import PrandtlIshlinskii
+from piezojax.hysteresis import InverseHysteresis, PrandtlIshlinskii
 
 SAMPLES = 12
 
@@ -258,13 +262,21 @@ LOOPS = {
         >> FirstOrderLag(3e-4, p753.DT),
         Sensor(0.01) >> Quantiser(0.002),
     ),
+    # Its Newton steps are a loop of fixed length, which the kernels unroll.
+    "numerical inverse": (
+        FeedforwardFeedback(
+            InverseHysteresis(p753.hysteresis(), -20.0, 120.0), p753.pid()
+        ),
+        p753.plant(),
+        Sensor(0.01),
+    ),
 }
 
 
 def loop_lanes(name):
     controller, plant, sensor = LOOPS[name]
     loop = Feedback(controller, plant, Saturation(-20.0, 120.0), sensor)
-    path = "sensor.noise_rms" if name == "observer" else "sensor.0.noise_rms"
+    path = "sensor.0.noise_rms" if "converter" in name else "sensor.noise_rms"
     return lanes_of(loop, path, loop_inputs(), Tracking(start=4), start=1.0)
 
 
@@ -273,6 +285,39 @@ def loop_lanes(name):
 @pytest.mark.parametrize("name", LOOPS)
 def test_loops_in_c(name, lanes):
     assert_engine_equals_loop("native", loop_lanes(name), spread(lanes))
+
+
+@needs_compiler
+@pytest.mark.skipif(
+    sys.platform != "linux" or "gcc" not in (library.compiler() or ""),
+    reason="the report is that of gcc",
+)
+@pytest.mark.parametrize("name", LOOPS)
+def test_the_lanes_of_a_loop_are_simd(name, tmp_path, monkeypatch):
+    """gcc reports the loops over lanes that it turns into SIMD instructions."""
+    sources, register = [], library.registered
+    monkeypatch.setattr(
+        native_kernel, "registered", lambda *a: sources.append(a) or register(*a)
+    )
+    lowered(lambda v: loop_lanes(name)(v, "native"), spread(8))
+    text = library._called(*sources[0])
+    (tmp_path / "run.c").write_text(text)
+    (first,) = [
+        number
+        for number, line in enumerate(text.splitlines(), 1)
+        if "INLINE void step_values(" in line
+    ]
+    flags = *library._flags(text), f"-I{jax.ffi.include_dir()}", "-fopt-info-vec"
+    command = [library.compiler(), *flags, "-o", "run.so", "run.c", "-lm"]
+    report = subprocess.run(
+        command, cwd=tmp_path, check=True, capture_output=True, text=True
+    ).stderr
+    places = [
+        int(line.split(":")[1])
+        for line in report.splitlines()
+        if "loop vectorized" in line
+    ]
+    assert any(first < place < first + 10 for place in places), report
 
 
 @pytest.mark.parametrize("in_registers", [True, False])

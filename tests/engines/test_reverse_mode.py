@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from piezojax.catalog import p558_control, p753
+from piezojax.control import FeedforwardFeedback
 from piezojax.core.arrays import as_array
 from piezojax.core.axes import PerAxisMetric
 from piezojax.core.feedback import Feedback, LoopInput
@@ -17,7 +18,7 @@ from piezojax.dynamics import FirstOrderLag
 from piezojax.engines import metered, reverse, reverse_mode
 from piezojax.engines import native_library as library
 from piezojax.hardware import Saturation, Sensor
-from piezojax.hysteresis import PrandtlIshlinskii
+from piezojax.hysteresis import InverseHysteresis, PrandtlIshlinskii
 
 pytestmark = pytest.mark.skipif(
     library.compiler() is None, reason="there is no C compiler"
@@ -145,6 +146,13 @@ LOOPS = {
         >> FirstOrderLag(3e-4, p753.DT),
         ("controller.proportional", "plant.0.polynomial.1"),
     ),
+    "numerical inverse": (
+        FeedforwardFeedback(
+            InverseHysteresis(p753.hysteresis(), -20.0, 120.0), p753.pid()
+        ),
+        p753.plant(),
+        ("controller.feedback.proportional", "controller.inverse.model.b"),
+    ),
 }
 
 
@@ -155,6 +163,7 @@ LOOPS = {
         ("observer", 17, True),
         ("plays and delay", 3, True),
         ("plays and delay", 17, False),
+        ("numerical inverse", 3, False),
     ],
 )
 def test_loops_of_many_lanes(name, lanes, shared):

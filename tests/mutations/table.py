@@ -76,6 +76,13 @@ MUTATIONS = (
         (_ENGINES, "-k", "derivatives"),
     ),
     Mutation(
+        "a loop of fixed length that no kernel has",
+        "engines/scalar_step.py",
+        "partial(trace, rolled=math.inf)",
+        "partial(trace, rolled=8)",
+        (_ENGINES, "-k", "loops_in_c"),
+    ),
+    Mutation(
         "a reverse pass without the first segment",
         "engines/native_templates.py",
         "segment = segments - 1; segment >= 0;",
@@ -434,6 +441,14 @@ MUTATIONS = (
         "structure = structure.with_before(records[0].input)",
         "structure = structure.without(())",
         ("tests/identification/test_input_before.py",),
+    ),
+    # Limits of the reference
+    Mutation(
+        "a limited reference that brakes too late",
+        "control/limited_reference.py",
+        "0.5 * most * (steps - 1.0)",
+        "0.6 * most * (steps - 1.0)",
+        ("tests/control/test_limited_reference.py",),
     ),
     # Two searches
     Mutation(
