@@ -113,8 +113,7 @@ def registered(text: str, rows: int) -> str:
 
 def _flags(text: str) -> tuple[str, ...]:
     """Return the flags of the compiler for a source."""
-    # Eliminating partial redundancies adds branches, which keep a loop from SIMD.
-    level = ("-O2", "-fno-tree-pre") if text.count("\n") < QUICK else ("-O1", "-fgcse")
+    level = ("-O2",) if text.count("\n") < QUICK else ("-O1", "-fgcse")
     return *level, *FLAGS
 
 

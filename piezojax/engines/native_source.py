@@ -8,6 +8,7 @@ from typing import NamedTuple
 import jax
 
 from ..scalar.graph import CONSTANT, INPUT
+from .native_math import FORMS, SOURCE
 from .native_templates import BACK, HEAD, PART, REVERSE, RUN, SLOPES, VALUES
 from .native_writer import Arrays, LaneWriter, Rows, carried_name
 from .scalar_step import Element, Place, ScalarStep
@@ -17,7 +18,7 @@ OPERATIONS = frozenset(
         *("abs", "add", "and", "ceil", "clamp", "convert_element_type", "div", "eq"),
         *("floor", "ge", "gt", "integer_pow", "is_finite", "le", "lt", "max", "min"),
         *("mul", "ne", "neg", "not", "or", "round", "rsqrt", "select_n", "sign"),
-        *("sqrt", "square", "sub", "xor"),
+        *("sqrt", "square", "sub", "xor", *FORMS),
     )
 )
 """Operations that compilers vectorise. A single other operation keeps the whole loop
@@ -163,6 +164,7 @@ class _Source:
         head = HEAD.substitute(
             shape._asdict(),
             outputs=len(step.log),
+            functions="" if step.operations().isdisjoint(FORMS) else SOURCE,
             fixed=_fields("double {};", in_fixed.names),
             steady=_fields("LANE_ARRAY({});", in_steady.names),
             kept=_fields("LANE_ARRAY({});", [f"v{n}" for n in kept]),

@@ -14,10 +14,14 @@ HEAD = Template("""#include <math.h>
 #define SEGMENT $segment
 #define OUTPUTS $outputs
 #define AHEAD 8  /* samples by which inputs are fetched ahead */
+#if WIDTH > 1 && !defined __clang__
+/* These passes put operations into branches, which keep loops over lanes from SIMD. */
+#pragma GCC optimize "no-tree-pre", "no-tree-sink", "no-thread-jumps"
+#endif
 #define LANES for (int l = 0; l < WIDTH; l++)
 #define INLINE static inline __attribute__((always_inline))
 #define LANE_ARRAY(name) double name[WIDTH] __attribute__((aligned(64)))
-
+$functions
 /* Values that do not change with the step: fixed in all lanes, steady by lane. */
 struct fixed {
 $fixed

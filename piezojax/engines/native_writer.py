@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from ..scalar.c_source import BITWISE, DOUBLE, FORMS, LOGICAL, Writer
 from ..scalar.graph import CONSTANT, INPUT, Node
+from . import native_math
 from .scalar_step import Place, ScalarStep
 
 
@@ -44,6 +45,7 @@ class LaneWriter(Writer):
         "min": "(({a} < {b}) | ({a} != {a})) ? {a} : {b}",
         "sign": "{a} > 0 ? 1 : ({a} < 0 ? -1 : {a})",
         "is_finite": "fabs({a}) <= 1.7976931348623157e308",
+        **native_math.FORMS,
     }
     logical = LOGICAL | BITWISE  # without branches
     types = MappingProxyType({"integer": "int64_t", "boolean": "bool"})

@@ -12,10 +12,12 @@ from typing import NamedTuple
 
 from ..scalar.graph import CONSTANT, Graph
 from ..scalar.simplify import Simplifier
+from .native_math import FORMS
 from .scalar_step import ScalarStep, sorted_step
 
 CYCLES = {
     **dict.fromkeys(("div", "sqrt", "rsqrt"), 13),
+    **dict.fromkeys(FORMS, 60),
     # For one lane, compilers write choices as branches, which processors predict.
     **dict.fromkeys(("abs", "clamp", "max", "min", "select_n"), 1),
 }

@@ -20,6 +20,7 @@ promise must be kept or the result have an alarm.
 import argparse
 import dataclasses
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -39,6 +40,7 @@ from treatments import TREATMENTS, treated
 import piezojax as pj
 from piezojax.control.devices import DEVICE_DESIGNS
 from piezojax.control.devices.servo_loop import FIXED_DT
+from piezojax.core.runtime import CACHE_VARIABLE
 from piezojax.signals.excitation import Generator
 from piezojax.signals.excitation import excitation as excited_by
 from piezojax.tuning.result import load_result
@@ -117,11 +119,18 @@ def recorded(stage, folder, dialect, record_of):
 
 
 def started(measured, folder, options):
-    """Return the exit status of a start, its output, and the seconds."""
+    """Return the exit status of a start, its output, and the seconds.
+
+    No program of an earlier start is at hand, as in the first sitting of a user.
+    """
     (file, own), begun = measured, time.perf_counter()
     command = [sys.executable, "-m", "piezojax.start", file, "--yes", *own, *options]
     done = subprocess.run(
-        [*command, "--out", folder / "out"], capture_output=True, text=True, check=False
+        [*command, "--out", folder / "out"],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, CACHE_VARIABLE: str(folder / "programs")},
     )
     seconds = time.perf_counter() - begun
     return done.returncode, done.stdout + done.stderr, seconds

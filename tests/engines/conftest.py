@@ -1,5 +1,6 @@
 import pytest
 
+from piezojax.engines import native_kernel
 from piezojax.engines import native_library as library
 
 
@@ -17,6 +18,16 @@ def compiled(monkeypatch, no_libraries):
     compile_ = library._compiled
     monkeypatch.setattr(
         library, "_compiled", lambda *a: found.append(a) or compile_(*a)
+    )
+    return found
+
+
+@pytest.fixture
+def sources(monkeypatch):
+    """Return a list of the sources of kernels, each with its number of inputs."""
+    found, register = [], library.registered
+    monkeypatch.setattr(
+        native_kernel, "registered", lambda *a: found.append(a) or register(*a)
     )
     return found
 
