@@ -1010,7 +1010,8 @@ def test_a_controller_contains_a_design(study, refusal):
         "tune": ["controller.feedback.*"],
     }
     assert to_data(case.loop.controller) == limited | {
-        "controller": to_data(read(study(alone)).loop.controller)
+        "acceleration": 1e12,  # the default is no limit
+        "controller": to_data(read(study(alone)).loop.controller),
     }
     of_catalog = {"controller": limited | {"controller": {"catalog": "p753_pid"}}}
     known = read(study(designed | of_catalog | {"tune": ["controller.controller.*"]}))
