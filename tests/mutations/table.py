@@ -83,6 +83,20 @@ MUTATIONS = (
         (_ENGINES, "-k", "loops_in_c"),
     ),
     Mutation(
+        "an exponential with one term less",
+        "engines/native_math.py",
+        "double series = 1.0 / 6227020800.0;",
+        "double series = 0.0;",
+        ("tests/engines/test_native_math.py", "-k", "exact"),
+    ),
+    Mutation(
+        "choices of lanes that become branches",
+        "engines/native_templates.py",
+        '"no-tree-pre", "no-tree-sink", ',
+        '"no-tree-pre", ',
+        ("tests/engines/test_native_math.py", "-k", "simd"),
+    ),
+    Mutation(
         "a reverse pass without the first segment",
         "engines/native_templates.py",
         "segment = segments - 1; segment >= 0;",
