@@ -84,8 +84,8 @@ def peak_notes(stability: StabilityReports) -> list[str]:
     return [
         f"the tuned loop amplifies references at {worst.closed_loop_peak_Hz:.4g} Hz by "
         f"{worst.closed_loop_peak:.3g}: filter references that contain this frequency, "
-        "as jumps do without a limit of their acceleration (LimitedReference), or limit "
-        "constraints.closed_loop_peak"
+        "as jumps do without a limit of their acceleration (LimitedReference), or "
+        "limit constraints.closed_loop_peak"
     ]
 
 
