@@ -201,7 +201,7 @@ def test_answers_replace_defaults(record):
         ({"frequency": 0.0}, "frequency is 0 Hz; it must be above 0"),
         ({"amplitude": -1.0}, "amplitude is -1 um; it must be above 0"),
         ({"slew": 0.0}, "slew is 0 um/s; it must be above 0"),
-        ({"acceleration": -2.0}, "acceleration is -2 um/s"),
+        ({"acceleration": -2.0}, r"acceleration is -2 um/s\^2; it must be above 0"),
         ({"noise": -0.1}, "noise is -0.1 um; it must be at least 0"),
         ({"noise": np.nan}, "noise is nan; it must be a number"),
         (

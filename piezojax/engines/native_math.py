@@ -6,6 +6,10 @@ functions here have no branches and no tables. Compilers that know the attribute
 run of one lane calls libm, which is faster there.
 """
 
+import math
+from collections.abc import Iterable
+from string import Template
+
 FORMS = {
     "exp": "lane_exp({a})",
     "expm1": "lane_expm1({a})",
@@ -17,11 +21,23 @@ FORMS = {
 }
 """Expressions of operations: operands a and b."""
 
-# Series: expm1(r) = r + r^2/2! + ... for |r| <= ln(2)/2, and for |f| <= sqrt(2) - 1
+
+def _series(at: str, denominators: Iterable[int]) -> str:
+    """Return C for 1/d + at/d' + at^2/d'' ... with ``denominators`` d, last first."""
+    first, *others = denominators
+    return "\n".join(
+        [
+            f"    double series = 1.0 / {first}.0;",
+            *(f"    series = series * {at} + 1.0 / {each}.0;" for each in others),
+        ]
+    )
+
+
+# expm1(r) = r + r^2/2! + ... for |r| <= ln(2)/2, and for |f| <= sqrt(2) - 1
 # log(1+f) = 2 artanh(s) with s = f/(2+f), artanh(s) = s + s^3/3 + ... Both end where
 # their next term is below the rounding error. ln(2) is a sum of two numbers; the first
 # has 11 zeros at its end, so that its products with exponents are exact.
-SOURCE = """
+SOURCE = Template("""
 #if WIDTH == 1
 INLINE double lane_exp(double x) { return exp(x); }
 INLINE double lane_expm1(double x) { return expm1(x); }
@@ -55,18 +71,7 @@ INLINE double divided(double x, double *power)
     const double sum = x * 0x1.71547652b82fep0 + 0x1.8p52;
     const double n = sum - 0x1.8p52;
     const double r = (x - n * 0x1.62e42fefa38p-1) - n * 0x1.ef35793c7673p-45;
-    double series = 1.0 / 6227020800.0;
-    series = series * r + 1.0 / 479001600.0;
-    series = series * r + 1.0 / 39916800.0;
-    series = series * r + 1.0 / 3628800.0;
-    series = series * r + 1.0 / 362880.0;
-    series = series * r + 1.0 / 40320.0;
-    series = series * r + 1.0 / 5040.0;
-    series = series * r + 1.0 / 720.0;
-    series = series * r + 1.0 / 120.0;
-    series = series * r + 1.0 / 24.0;
-    series = series * r + 1.0 / 6.0;
-    series = series * r + 0.5;
+$expm1_series
     *power = real_of((bits_of(sum) + 1023) << 52);
     return series * r * r + r;
 }
@@ -100,16 +105,7 @@ INLINE double log_of(double x)
     const double n = real_of(exponent | 0x4330000000000000) - (0x1p52 + 1023.0);
     const double f = real_of(bits - (exponent << 52) + 0x3ff0000000000000) - 1.0;
     const double s = f / (f + 2.0), square = s * s;
-    double series = 1.0 / 21.0;
-    series = series * square + 1.0 / 19.0;
-    series = series * square + 1.0 / 17.0;
-    series = series * square + 1.0 / 15.0;
-    series = series * square + 1.0 / 13.0;
-    series = series * square + 1.0 / 11.0;
-    series = series * square + 1.0 / 9.0;
-    series = series * square + 1.0 / 7.0;
-    series = series * square + 1.0 / 5.0;
-    series = series * square + 1.0 / 3.0;
+$artanh_series
     /* 2 s = f - s f, and f is exact. */
     const double small = f - s * (f - 2.0 * square * series);
     const double found = n * 0x1.62e42fefa38p-1 + (small + n * 0x1.ef35793c7673p-45);
@@ -155,7 +151,10 @@ FUNCTION lane_tanh(double x)
     return x < 0.0 ? -size : size;
 }
 #endif
-"""
+""").substitute(
+    expm1_series=_series("r", map(math.factorial, range(13, 1, -1))),
+    artanh_series=_series("square", range(21, 1, -2)),
+)
 """Source of the functions, after the macros and headers of ``native_templates``.
 
 Subnormal numbers count as 0: XLA lets the processor flush them."""

@@ -17,6 +17,7 @@ from .scalar_step import ScalarStep, sorted_step
 
 CYCLES = {
     **dict.fromkeys(("div", "sqrt", "rsqrt"), 13),
+    # Series of a dozen terms, which wait for each other.
     **dict.fromkeys(FORMS, 60),
     # For one lane, compilers write choices as branches, which processors predict.
     **dict.fromkeys(("abs", "clamp", "max", "min", "select_n"), 1),

@@ -48,7 +48,7 @@ def advance_stops(change: Scalar, memory: Memory, thresholds: Memory) -> Memory:
 
 def _limited(value: Scalar, low: Scalar, high: Scalar) -> Scalar:
     # jnp.maximum divides its gradient between equal arguments, which takes twice as
-    # long; jnp.where takes twice as long to trace.
+    # long; jnp.where takes longer to trace.
     inside = jax.lax.select(value > high, high, value)
     return jax.lax.select(value < low, low, inside)
 

@@ -1,6 +1,6 @@
 """Plan of a first study: the values that it needs besides a record."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -221,7 +221,8 @@ def planned(shown: Shown, given: dict[str, Any]) -> Plan:
     low, high = shown.outputs
     amplitude = known.get("amplitude", _rounded(SHARE * (high - low)))
 
-    def plan_of(frequency: float) -> Plan:
+    # The limits of the references follow from a plan without them.
+    def plan_of(frequency: float, slew: float = 1.0, acceleration: float = 1.0) -> Plan:
         suggested = {
             "lower": _rounded(shown.inputs[0]),
             "upper": _rounded(shown.inputs[1]),
@@ -230,8 +231,8 @@ def planned(shown: Shown, given: dict[str, Any]) -> Plan:
             "track": f"SIN{frequency:g},PWSW{4.0 * frequency:g}",
             "amplitude": amplitude,
             "offset": _rounded(0.5 * (low + high) - amplitude),
-            "slew": 1.0,  # this and the next until the references are known
-            "acceleration": 1.0,
+            "slew": _rounded(slew),
+            "acceleration": _rounded(acceleration),
             "lowest": _rounded(low),
             "highest": _rounded(high),
             "slew_rate": _rounded(shown.slew or 0.0),
@@ -247,11 +248,7 @@ def planned(shown: Shown, given: dict[str, Any]) -> Plan:
         fastest, _ = _limits(plan, shown.dt)
         if fastest > recorded:
             plan = plan_of(_round_below(plan.frequency * recorded / fastest))
-    slew, acceleration = (_rounded(limit) for limit in _limits(plan, shown.dt))
-    suggested = {"slew": slew, "acceleration": acceleration}
-    plan = replace(
-        plan, **{name: v for name, v in suggested.items() if name not in known}
-    )
+    plan = plan_of(plan.frequency, *_limits(plan, shown.dt))
     least, most = plan.offset, plan.offset + 2.0 * plan.amplitude
     beyond = BEYOND * (high - low)
     if least < low - beyond or most > high + beyond:
