@@ -30,10 +30,6 @@ DIVERGED = 1e6
 TOLERANCE = 1e-9
 """Relative change of loss and parameters below which a descent ends."""
 
-RULE = TRUST_REGION._replace(good=0.75)
-"""Rule of the damping: it falls after a step that achieves 3/4 of the predicted
-decrease. The default of 0.99 keeps the steps through a curved valley short."""
-
 
 @eqx.filter_jit
 def steady_response(
@@ -94,7 +90,10 @@ def fit_steady_state(
         return np.where(size > 0.0, size / output.size, 1.0)
 
     descents = GaussNewton(
-        [Descent(start, RULE, tolerance=TOLERANCE) for start in np.asarray(starts)],
+        [
+            Descent(start, TRUST_REGION, tolerance=TOLERANCE)
+            for start in np.asarray(starts)
+        ],
         trials_with_models(
             lambda points: _normal_equations(problem, points), len(starts), metric
         ),
