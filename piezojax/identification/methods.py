@@ -20,7 +20,7 @@ from .estimators.linear import by_frequency_response, by_subspace
 from .estimators.model_bouc_wen import bouc_wen
 from .estimators.model_preisach import PLAIN, RATE_DEPENDENT, preisach_with_lag
 from .estimators.neural import fit_neural_state_space
-from .estimators.output_error import PASSES, Optimum, output_error, values_and_errors
+from .estimators.output_error import Optimum, output_error, values_and_errors
 from .estimators.regression import instrumental_variables, least_squares
 from .estimators.resonances import LinearDynamics
 from .estimators.scheduled_fit import MODEL as SCHEDULED
@@ -79,8 +79,6 @@ def _by_output_error(
             steps=options.steps,
             progress=progress,
             own_starts=several,
-            # A look has fitted the stage already.
-            passes=PASSES if shape.guess is None else PASSES - 1,
         )
         found = LoopFit(optimum, optimum.system, shape, text, [])
     system, optimum, shape = found.system, found.optimum, found.shape

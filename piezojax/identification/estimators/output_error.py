@@ -37,8 +37,11 @@ TRIAL_STEPS = 12
 ROUGH_STEPS = 24
 """Number of steps of a fit from which another one starts."""
 
-PASSES = 3
-"""Searches for the starts of several records, each followed by a fit, by default."""
+PASSES = 8
+"""Most searches for the starts of several records, each followed by a fit."""
+
+PASSED = 0.95
+"""Ratio of the mean squares after two of these fits above which one more is enough."""
 
 NOISE_PASSES = 4
 """Largest number of alternate fits of a noise model and the parameters."""
@@ -125,8 +128,8 @@ def output_error(
     chain. With several records, or with ``own_starts``, the state
     before each record and its zero are estimated in place of the structure's ``own``
     parameters, and the ``vague`` parameters have a weak prior at the first start; its
-    scale follows from the errors of a first fit without it. ``passes`` is the number of
-    searches for the states, each followed by a fit.
+    scale follows from the errors of a first fit without it, then of each fit with it.
+    ``passes`` is the largest number of searches for the states, each followed by a fit.
 
     With a ``noise_model`` the error is that of the prediction by the model and an
     autoregressive model of its errors, which are fitted alternately (Ljung, System
@@ -170,19 +173,27 @@ def output_error(
     progress.stage(f"compiling the fit of {starts.shape[1]} parameters")
     rough = min(steps, ROUGH_STEPS) if whitened or several else steps
     units, losses, finished = _inside(starts), np.zeros(len(starts)), False
-    rounds = passes if several else 1
-    for left in reversed(range(rounds)):
+    settled = not several
+    for turn in range(passes):
         if several:
             system = problem.space.put(problem.system, as_array(units[0]))
             found, *_ = starts_of(system, records, train)
             problem = at_starts(problem, found)
-        if cautious and left < rounds - 1:
+        if cautious and turn:
             prior = _lighter(prior, _first_guess(structure, problem, units[0]))
             problem = _with_prior(problem, prior)
-        last = not left and not whitened
+        last, before = settled or turn == passes - 1, losses[0]
         units, losses, finished = _descended(
-            problem, _inside(units), width, steps if last else rough, progress
+            problem,
+            _inside(units),
+            width,
+            steps if last and not whitened else rough,
+            progress,
         )
+        if last:
+            break
+        # The first fit has no prior: its mean square compares with no other.
+        settled = turn > int(cautious) and losses[0] > PASSED * before
     before = np.inf
     for _ in range(NOISE_PASSES if noise_model else int(whitened)):
         point = as_array(units[0])
