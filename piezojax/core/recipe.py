@@ -32,7 +32,8 @@ class Extent(NamedTuple):
     ``delay`` and ``slew`` None, if none were found or no search was made. ``jump`` is
     the largest step of the input if its few steps may hide a slew rate in ``delay``,
     else 0. ``reach`` multiplies the distance of the bounds from the modes that were
-    found.
+    found. ``before`` is the range of the input before the records, if the motions there
+    are estimated, as a multiple of its range within them.
     """
 
     low: float  # V
@@ -49,6 +50,7 @@ class Extent(NamedTuple):
     slew: float | None = None  # V/s
     jump: float = 0.0  # V
     reach: float = 1.0
+    before: float = 1.0
 
     def mirrored(self) -> "Extent":
         """Return the extent of the same record with the sign of its output changed."""

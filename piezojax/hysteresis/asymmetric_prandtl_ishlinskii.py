@@ -10,7 +10,6 @@ from ..core.recipe import Extent, Fittable, Part, Recipe, rest_starts, scaled_ra
 from .inverse import Inverse, InverseHysteresis
 from .model import Hysteresis, Laws, turning_point_laws
 from .plays import (
-    FITTED_WEIGHTS,
     PLAYS,
     Memory,
     advance_plays,
@@ -30,7 +29,8 @@ class AsymmetricPrandtlIshlinskii(Hysteresis, Fittable):
     The width in x of a play of q shrinks as x grows. The envelope functions of a
     generalised play skew a loop in the same way (Al Janaideh, Rakheja and Su 2009,
     Mechatronics 19(5)); the output is linear in ``skew``, but not in the parameters of
-    those functions. Units, memory, remaining parameters and errors are those of
+    those functions. ``skew`` may be shorter than ``weights``: the widest plays have
+    none then. Units, memory, remaining parameters and errors are those of
     PrandtlIshlinskii.
     """
 
@@ -50,24 +50,29 @@ class AsymmetricPrandtlIshlinskii(Hysteresis, Fittable):
     weights: Scalars = parameter("um/V", "slopes of the plays", converter=as_scalars)
     skew: Scalars = parameter("um/V", "slopes of the plays of q", converter=as_scalars)
     origin: Scalar = parameter("V", "input at which the loop is widest")
-    scale: Scalar = parameter("V", "span of the input", above=0.0)
+    scale: Scalar = parameter(
+        "V", "rise above origin at which q has slope 1", above=0.0
+    )
     rest_input: Scalar = parameter("V", "input of the virgin state", default=0.0)
 
     def __check_init__(self):
         check_plays(self.thresholds, self.weights)
-        check_plays(self.thresholds, self.skew, "skew weights")
+        check_plays(self._skewed, self.skew, "skew weights")
+
+    @property
+    def _skewed(self) -> Scalars:
+        return self.thresholds[: len(self.skew)]
 
     def _square(self, x: Scalar) -> Scalar:
         return 0.5 * jnp.maximum(x - self.origin, 0.0) ** 2 / self.scale
 
     def init(self, input: ScalarLike = 0.0) -> tuple[Memory, Memory]:
         input, virgin = as_array(input), self.rest_input
-        count = len(self.thresholds)
+        virgins = (virgin,) * len(self.thresholds)
+        squares = (self._square(virgin),) * len(self.skew)
         return (
-            advance_plays(input, (virgin,) * count, self.thresholds),
-            advance_plays(
-                self._square(input), (self._square(virgin),) * count, self.thresholds
-            ),
+            advance_plays(input, virgins, self.thresholds),
+            advance_plays(self._square(input), squares, self._skewed),
         )
 
     def step(
@@ -75,7 +80,7 @@ class AsymmetricPrandtlIshlinskii(Hysteresis, Fittable):
     ) -> tuple[tuple[Memory, Memory], Scalar]:
         input = as_array(input)
         plain = advance_plays(input, state[0], self.thresholds)
-        skewed = advance_plays(self._square(input), state[1], self.thresholds)
+        skewed = advance_plays(self._square(input), state[1], self._skewed)
         output = polynomial_part(self.polynomial, input)
         output = (
             output + weighted_sum(self.weights, plain) + weighted_sum(self.skew, skewed)
@@ -88,13 +93,15 @@ class AsymmetricPrandtlIshlinskii(Hysteresis, Fittable):
         skews = {
             f"skew.{i}": scaled_range(extent.slope, -2.0, 2.0) for i in range(PLAYS)
         }
+        # q has the range of x, so that each of its plays moves in a full cycle.
+        half = 0.5 * extent.width
         return Recipe(
-            cls(**fields, skew=(0.0,) * PLAYS, origin=extent.low, scale=extent.width),
+            cls(**fields, skew=(0.0,) * PLAYS, origin=extent.low, scale=half),
             {**bounds, **skews},
             rest_starts(extent),
             gain="polynomial.0",
             own=("rest_input",),
-            vague=typical_distances(extent, (*FITTED_WEIGHTS, *skews)),
+            vague=typical_distances(extent, (*bounds, *skews)),
         )
 
     def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:

@@ -18,10 +18,8 @@ ITERATIONS = 20
 """Newton steps for a polynomial P; bisection replaces one that leaves the bracket."""
 
 PLAYS = 10
-"""Operators of a fitted Prandtl-Ishlinskii model."""
-
-FITTED_WEIGHTS = tuple(f"weights.{i}" for i in range(PLAYS))
-"""Their weights."""
+"""Operators of a fitted Prandtl-Ishlinskii model that move in every cycle over the
+range of a record."""
 
 
 def advance_plays(input: Scalar, memory: Memory, thresholds: Memory) -> Memory:
@@ -62,24 +60,31 @@ def check_plays(thresholds: Memory, weights: Memory, name: str = "weights") -> N
         )
 
 
-def typical_distances(
-    extent: Extent, paths: Iterable[str] = FITTED_WEIGHTS
-) -> dict[str, float]:
-    """Return typical distances (um/V) of weights of plays from their first guesses."""
-    return dict.fromkeys(paths, 0.02 * abs(extent.slope))
+def typical_distances(extent: Extent, bounds: Iterable[str]) -> dict[str, float]:
+    """Return typical distances (um/V) of weights of plays from their first guesses.
+
+    ``bounds`` are the paths of the fitted parameters, which include these weights.
+    """
+    weights = [path for path in bounds if path.startswith(("weights.", "skew."))]
+    return dict.fromkeys(weights, 0.02 * abs(extent.slope))
 
 
 def plays_recipe(extent: Extent) -> tuple[dict[str, Any], dict[str, Range]]:
-    """Return the fields and bounds that all Prandtl-Ishlinskii models share."""
+    """Return the fields and bounds that all Prandtl-Ishlinskii models share.
+
+    A play with a half-width above half the range of the input adds no hysteresis to its
+    cycles. If the input had a wider range before the records, such a play may still
+    move when the input first exceeds the extrema since then.
+    """
     width, slope = extent.width, extent.slope
-    # A play with a half-width above half the range of the input adds no hysteresis.
-    thresholds = 0.5 * width * np.arange(1, PLAYS + 1) / (PLAYS + 1)
+    count = round(extent.before * (PLAYS + 1)) - 1
+    thresholds = 0.5 * width * np.arange(1, count + 1) / (PLAYS + 1)
     scales = [slope / width**i for i in range(3)]
     return (
         {
             "polynomial": (0.7 * slope, 0.0, 0.0),
             "thresholds": thresholds,
-            "weights": (0.3 * slope / PLAYS,) * PLAYS,
+            "weights": (0.3 * slope / PLAYS,) * count,
             "rest_input": extent.first[0],
         },
         {
@@ -87,7 +92,7 @@ def plays_recipe(extent: Extent) -> tuple[dict[str, Any], dict[str, Range]]:
                 f"polynomial.{i}": scaled_range(s, -10.0, 10.0)
                 for i, s in enumerate(scales)
             },
-            **{path: scaled_range(slope, 0.0, 1.0) for path in FITTED_WEIGHTS},
+            **{f"weights.{i}": scaled_range(slope, 0.0, 1.0) for i in range(count)},
             **rest_bounds(extent),
         },
     )

@@ -72,7 +72,7 @@ class PrandtlIshlinskii(Hysteresis, Fittable):
             rest_starts(extent),
             gain="polynomial.0",
             own=("rest_input",),
-            vague=typical_distances(extent),
+            vague=typical_distances(extent, bounds),
         )
 
     def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:

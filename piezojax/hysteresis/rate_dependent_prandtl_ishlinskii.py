@@ -101,7 +101,7 @@ class RateDependentPrandtlIshlinskii(Hysteresis, Fittable):
             rest_starts(extent),
             gain="polynomial.0",
             own=("rest_input",),
-            vague=typical_distances(extent),
+            vague=typical_distances(extent, bounds),
         )
 
     def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:

@@ -13,6 +13,7 @@ from ..core.system import Affine, Series, series
 from ..hysteresis.model import Hysteresis
 from .estimators.resonances import LinearDynamics, linear_dynamics
 from .estimators.slew_rate import few_steps, has_steps
+from .estimators.start_search import BEYOND
 from .estimators.structure import Structure, distinct
 from .held_dynamics import HeldDynamics
 from .records.record import Record
@@ -173,6 +174,7 @@ def extent_of(
         slew=shown.slew,
         jump=_unclear_step(record, beside),
         reach=reach,
+        before=1.0 + 2.0 * BEYOND if beside else 1.0,
     )
 
 
