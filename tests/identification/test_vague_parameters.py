@@ -13,6 +13,7 @@ from piezojax.identification.estimators.free_runs import starts_of
 from piezojax.identification.estimators.structure import Prior
 
 DT, SAMPLES, NOISE = 1e-3, 400, 2e-2
+QUIET = 2e-3
 MODEL = "prandtl_ishlinskii+exponential_creep+lag"
 VAGUE = [*(f"hysteresis.weights.{i}" for i in range(14))]
 VAGUE += [f"creep.gains.{i}" for i in range(4)]
@@ -27,13 +28,13 @@ def response(u):
     return np.append(motion[1], motion[1:-1])  # a voltage acts on the next sample
 
 
-def record_of(height, seed):
+def record_of(height, seed, noise=NOISE):
     """Return the record of a swing over the range and small cycles after it."""
     time = DT * np.arange(SAMPLES)
     u = 50.0 + height * np.sin(2.0 * np.pi * 8.0 * time)
     u[:100] = 50.0 + 45.0 * np.sin(2.0 * np.pi * 10.0 * time[:100])
-    noise = NOISE * np.random.default_rng(seed).standard_normal(SAMPLES)
-    return Record(u, response(u) + noise, DT, source=f"{height} V")
+    errors = noise * np.random.default_rng(seed).standard_normal(SAMPLES)
+    return Record(u, response(u) + errors, DT, source=f"{height} V")
 
 
 @pytest.fixture(scope="module")
@@ -114,6 +115,17 @@ def test_gains_of_creep_that_is_not_seen_stay_near_the_first_guess(
     )
     assert 5.0 * distance(optimum, shape) < distance(free, shape)
     assert optimum.losses[0] < 1.2 * free.losses[0]
+
+
+def test_the_prior_follows_the_errors_until_they_settle():
+    records = [record_of(8.0, 1, QUIET), record_of(14.0, 2, QUIET)]
+    shape, part = structure(MODEL, records[0], beside=records[1:]), slice(0, SAMPLES)
+    # The errors of the first fit are far above the noise: their prior is too heavy.
+    early, settled = (
+        fits.output_error(shape, records, part, steps=40, **passes).losses[0]
+        for passes in ({"passes": 3}, {})
+    )
+    assert settled < 0.5 * early
 
 
 def test_the_errors_are_those_of_the_records_alone(optimum):

@@ -456,6 +456,21 @@ MUTATIONS = (
         "structure = structure.without(())",
         ("tests/identification/test_input_before.py",),
     ),
+    # Several records
+    Mutation(
+        "plays of several records that are as wide as their cycles",
+        "identification/chain.py",
+        "before=1.0 + 2.0 * BEYOND if beside else 1.0",
+        "before=1.0",
+        ("tests/identification/test_wide_plays.py",),
+    ),
+    Mutation(
+        "fits of several records that end with their first prior",
+        "identification/estimators/output_error.py",
+        "settled = turn > int(cautious) and losses[0] > PASSED * before",
+        "settled = turn > 0",
+        ("tests/identification/test_vague_parameters.py",),
+    ),
     # Limits of the reference
     Mutation(
         "a limited reference that brakes too late",
