@@ -29,8 +29,7 @@ class AsymmetricPrandtlIshlinskii(Hysteresis, Fittable):
     The width in x of a play of q shrinks as x grows. The envelope functions of a
     generalised play skew a loop in the same way (Al Janaideh, Rakheja and Su 2009,
     Mechatronics 19(5)); the output is linear in ``skew``, but not in the parameters of
-    those functions. ``skew`` may be shorter than ``weights``: the widest plays have
-    none then. Units, memory, remaining parameters and errors are those of
+    those functions. Units, memory, remaining parameters and errors are those of
     PrandtlIshlinskii.
     """
 
@@ -57,22 +56,19 @@ class AsymmetricPrandtlIshlinskii(Hysteresis, Fittable):
 
     def __check_init__(self):
         check_plays(self.thresholds, self.weights)
-        check_plays(self._skewed, self.skew, "skew weights")
-
-    @property
-    def _skewed(self) -> Scalars:
-        return self.thresholds[: len(self.skew)]
+        check_plays(self.thresholds, self.skew, "skew weights")
 
     def _square(self, x: Scalar) -> Scalar:
         return 0.5 * jnp.maximum(x - self.origin, 0.0) ** 2 / self.scale
 
     def init(self, input: ScalarLike = 0.0) -> tuple[Memory, Memory]:
         input, virgin = as_array(input), self.rest_input
-        virgins = (virgin,) * len(self.thresholds)
-        squares = (self._square(virgin),) * len(self.skew)
+        count = len(self.thresholds)
         return (
-            advance_plays(input, virgins, self.thresholds),
-            advance_plays(self._square(input), squares, self._skewed),
+            advance_plays(input, (virgin,) * count, self.thresholds),
+            advance_plays(
+                self._square(input), (self._square(virgin),) * count, self.thresholds
+            ),
         )
 
     def step(
@@ -80,7 +76,7 @@ class AsymmetricPrandtlIshlinskii(Hysteresis, Fittable):
     ) -> tuple[tuple[Memory, Memory], Scalar]:
         input = as_array(input)
         plain = advance_plays(input, state[0], self.thresholds)
-        skewed = advance_plays(self._square(input), state[1], self._skewed)
+        skewed = advance_plays(self._square(input), state[1], self.thresholds)
         output = polynomial_part(self.polynomial, input)
         output = (
             output + weighted_sum(self.weights, plain) + weighted_sum(self.skew, skewed)
@@ -93,10 +89,12 @@ class AsymmetricPrandtlIshlinskii(Hysteresis, Fittable):
         skews = {
             f"skew.{i}": scaled_range(extent.slope, -2.0, 2.0) for i in range(PLAYS)
         }
+        # Plays that are wider than the cycles have no skew.
+        none = (0.0,) * len(fields["thresholds"])
         # q has the range of x, so that each of its plays moves in a full cycle.
         half = 0.5 * extent.width
         return Recipe(
-            cls(**fields, skew=(0.0,) * PLAYS, origin=extent.low, scale=half),
+            cls(**fields, skew=none, origin=extent.low, scale=half),
             {**bounds, **skews},
             rest_starts(extent),
             gain="polynomial.0",
