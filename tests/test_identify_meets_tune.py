@@ -106,7 +106,8 @@ def plant(model):
 def models():
     whole = {model for method in METHODS.values() for model in method.models}
     whole.remove("amplitude_scheduled")  # of several channels; designs are for one
-    return [automatic(record()).model, *parts(), *sorted(whole)]
+    names = [automatic(record()).model, *parts(), *sorted(whole)]
+    return list(dict.fromkeys(names))
 
 
 def loop_around(controller, system):

@@ -4,6 +4,8 @@ import abc
 from collections.abc import Mapping, Sequence
 from typing import ClassVar, NamedTuple
 
+import numpy as np
+
 from .space import Range
 from .system import System
 
@@ -63,6 +65,21 @@ class Extent(NamedTuple):
         return self.high - self.low
 
 
+class LinearWeights(NamedTuple):
+    """Weights of at least 0 in which the output is linear, and which vary smoothly.
+
+    ``path`` is that of an array, ``places`` the positions of its k free elements, an
+    index array for each axis. ``least`` [k] are their lower bounds. Each row of
+    ``differences`` [pairs, k] is that between two neighbours, as a multiple of its
+    typical size.
+    """
+
+    path: str
+    places: tuple[np.ndarray, ...]
+    least: np.ndarray
+    differences: np.ndarray
+
+
 class Recipe(NamedTuple):
     """First guess, bounds and starting values for fitting a System.
 
@@ -72,7 +89,8 @@ class Recipe(NamedTuple):
     scales the output. ``own`` holds the paths of parameters with a separate value for
     each record: the state before it began. ``vague`` holds those of the terms of a sum,
     which only records of every kind of motion determine one by one, each with its
-    typical distance from the first guess.
+    typical distance from the first guess. ``linear`` declares weights that are too many
+    for a descent: they follow from least squares, given all other parameters.
     """
 
     system: System
@@ -81,6 +99,7 @@ class Recipe(NamedTuple):
     gain: str | None = None
     own: tuple[str, ...] = ()
     vague: Mapping[str, float] = {}
+    linear: LinearWeights | None = None
 
 
 class Part(NamedTuple):

@@ -20,6 +20,15 @@ from ..core.arrays import (
     concrete,
 )
 from ..core.parameter import parameter
+from ..core.recipe import (
+    Extent,
+    Fittable,
+    LinearWeights,
+    Part,
+    Recipe,
+    rest_bounds,
+    rest_starts,
+)
 from ..core.system import Designed, System
 from .inverse import Inverse
 from .model import Hysteresis, Laws, turning_point_laws
@@ -31,11 +40,19 @@ STARTS = ("virgin", "saturated")
 """Initial states of the material."""
 
 
+CELLS, SHARE = 24, 0.3
+"""Cells per side of a fit, and the share of the output that they add to the diagonal
+in the first guess."""
+
+LEAST_SLOPE = 0.01
+"""Least slope after a turn, as a share of the mean slope of a record: the inverse is
+continuous."""
+
 ROUNDING = 1e-13
 """Change of the output, um, below which the inverse does not change its voltage."""
 
 
-class Preisach(Hysteresis, Designed):
+class Preisach(Hysteresis, Fittable, Designed):
     """Weighted sum of relays, (2.1)-(2.2), which are up (1) or down (0).
 
     A relay goes up when the input rises through its alpha and down when it falls
@@ -64,6 +81,10 @@ class Preisach(Hysteresis, Designed):
     """
 
     laws: ClassVar[Laws] = turning_point_laws()
+    part: ClassVar[Part] = Part(
+        "preisach", "hysteresis", "Preisach: a smooth density on a triangle of 24 cells"
+    )
+    rising: ClassVar[bool] = True
 
     weights: Matrix = parameter("um", "weights", least=0.0, converter=as_matrix)
     low: Scalar = parameter("V", "lowest input")
@@ -96,6 +117,33 @@ class Preisach(Hysteresis, Designed):
             self.start,
         )
 
+    @classmethod
+    def recipe(cls, extent: Extent) -> Recipe:
+        beyond = 0.5 * (extent.before - 1.0) * extent.width
+        low, high = extent.low - beyond, extent.high + beyond
+        places = tuple(np.transpose(line_by_line(CELLS)))
+        rise = extent.slope * (high - low)
+        diagonal = places[0] == places[1]
+        weights = np.zeros((CELLS, CELLS))
+        weights[places] = np.where(
+            diagonal,
+            (1.0 - SHARE) * rise / CELLS,
+            SHARE * rise / np.count_nonzero(~diagonal),
+        )
+        differences = neighbours(line_by_line(CELLS))
+        return Recipe(
+            cls(weights, low, high, extent.slope * low, extent.first[0]),
+            rest_bounds(extent),
+            rest_starts(extent),
+            own=("rest_input",),
+            linear=LinearWeights(
+                "weights",
+                places,
+                np.where(diagonal, LEAST_SLOPE * rise / CELLS, 0.0),
+                differences / (0.5 * np.abs(differences) @ weights[places])[:, None],
+            ),
+        )
+
     def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:
         del lower, upper  # the inverse holds over the triangle, and saturates beyond it
         return InversePreisach(self)
@@ -124,6 +172,28 @@ def rows_of(weights: Matrix) -> Rows:
     alpha = column + column[:, None]
     lines = jnp.where(alpha < cells, weights[alpha % cells, column[:, None]], 0.0)
     return tuple(lines)
+
+
+def line_by_line(cells: int) -> list[tuple[int, int]]:
+    """Return the cells in the order of PlayLines: along one line after another."""
+    return [(j + k, j) for k in range(cells) for j in range(cells - k)]
+
+
+def neighbours(places: list[tuple[int, int]]) -> np.ndarray:
+    """Return the matrix of differences between neighbours off the diagonal.
+
+    The diagonal, which has no hysteresis, is smoothed only along itself.
+    """
+    index = {place: at for at, place in enumerate(places)}
+    rows = []
+    for (i, j), at in index.items():
+        for other in ((i + 1, j), (i, j + 1), (i + 1, j + 1)):
+            within = (i == j) == (other[0] == other[1])
+            if other in index and within:
+                row = np.zeros(len(places))
+                row[[at, index[other]]] = -1.0, 1.0
+                rows.append(row)
+    return np.array(rows).reshape(-1, len(places))
 
 
 class Traverse(NamedTuple):

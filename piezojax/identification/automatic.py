@@ -1,7 +1,7 @@
 """Default model: the hysteresis that describes a record best, and its dynamics."""
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +10,7 @@ from ..core.arrays import as_array
 from ..core.progress import Progress, Silent
 from ..hysteresis.model import hystereses
 from .chain import dynamics_of, dynamics_parts, structure
-from .estimators.free_runs import from_rest, starts_of
+from .estimators.free_runs import from_rest
 from .estimators.output_error import leading, output_error
 from .estimators.resonances import LinearDynamics
 from .held_dynamics import HeldDynamics
@@ -29,8 +29,9 @@ wiped out, and with a memory that decays along the input."""
 PLAYS = HYSTERESES[1]
 """The one of them behind which the dynamics are looked at."""
 
-FROM_SEVERAL = (*HYSTERESES[:2], "dahl_frictions")
-"""The same for several records: they determine the bends of several frictions."""
+FROM_SEVERAL = (*HYSTERESES[:2], "dahl_frictions", "preisach")
+"""The same for several records: they determine the bends of several frictions, and the
+density of a Preisach model."""
 
 CREEP = "exponential_creep"
 """Creep of the default model."""
@@ -52,8 +53,8 @@ hysteresis depends on every motion, the fast ones included."""
 RESOLVED = 8.0
 """Least number of samples in a period of the fastest resonance in a trial."""
 
-STEPS, PASSES = 24, 2
-"""Number of steps of a trial, and of its searches for the state before a record."""
+STEPS, PASSES = 24, 3
+"""Number of steps of each fit of a trial, and of its fits to several records."""
 
 
 class Chosen(NamedTuple):
@@ -76,10 +77,10 @@ def automatic(
     """Return the default chain for ``record``, the training samples.
 
     The hysteresis is the first of ``HYSTERESES``, or ``FROM_SEVERAL``, unless another
-    one has a clearly smaller error (``CLEARLY``) after short fits to ``record`` and
-    those ``beside`` it.
-    The fits use the first samples of a long record (``leading``), and a lower sampling
-    rate if it resolves the resonances and the input.
+    one has a clearly smaller error (``CLEARLY``) after a short fit to ``record`` and
+    those ``beside`` it together.
+    The fits use the first samples of a long record (``leading``), those to a single one
+    also a lower sampling rate if it resolves the resonances and the input.
     With ``dynamics``, which are held, the chain has no other dynamics.
     """
     records = [record, *beside]
@@ -104,31 +105,64 @@ def hysteresis_for(
 
     Bounds, and the dynamics if they are not held, are derived from the first record.
     """
-    first, *others = HYSTERESES if len(records) == 1 else FROM_SEVERAL
     if records[0].samples < LEAST:
-        return Chosen(first, None)
-    progress, shown = progress or Silent(), None
+        return Chosen(HYSTERESES[0], None)
+    progress = progress or Silent()
     progress.stage("choosing the hysteresis")
     records = [
         each.until(leading(each.input, slice(0, each.samples)).stop) for each in records
     ]
-    if len(records) > 1 and dynamics is None:
-        whole = slice(0, max(record.samples for record in records))
+    if others := records[1:]:
+        return _for_several(records[0], others, progress, dynamics)
+    every = _slowing(records[0])
+    slow = _slowed(records[0], every)
+    return Chosen(_best(HYSTERESES, lambda name: _error(name, slow, dynamics)), None)
+
+
+def _best(names: Sequence[str], error: Callable[[str], float]) -> str:
+    """Return the first of ``names``, or one with a clearly smaller ``error``."""
+    chosen, *others = names
+    least = CLEARLY * error(chosen)
+    for name in others:
+        found = error(name)
+        if found < least:
+            least, chosen = found, name
+    return chosen
+
+
+def _for_several(
+    first: Record,
+    beside: Sequence[Record],
+    progress: Progress,
+    dynamics: HeldDynamics | None,
+) -> Chosen:
+    records, shown = [first, *beside], None
+    whole = slice(0, max(record.samples for record in records))
+    if dynamics is None:
         plays = _chain_of(PLAYS, records, None)
         # Plays that do not fit leave the dynamics at first sight.
         with contextlib.suppress(ValueError):
             shown = seen_again(plays, records, whole, progress, looks=LOOKS).shown
-    # Of one length, so that the programs of a trial are compiled once.
-    shortest = min(record.samples for record in records)
-    records = [record.until(shortest) for record in records]
-    every = _slowing(records[0])
-    slow = [_slowed(record, every) for record in records]
-    least, chosen = CLEARLY * _error(first, slow, dynamics, shown), first
-    for name in others:
-        error = _error(name, slow, dynamics, shown)
-        if error < least:
-            least, chosen = error, name
-    return Chosen(chosen, shown)
+
+    def error(name: str) -> float:
+        """Return the rms error after a short fit to all records, infinite if it fails.
+
+        It includes the deviations from the prior, so that a model does not win by
+        parameters that the records do not determine.
+        """
+        chain = _chain_of(name, records, dynamics)
+        shape = structure(chain, first, dynamics, beside=beside, shown=shown)
+        if shown is not None:
+            shape = shape._replace(whitening=())  # the dynamics are known already
+        try:
+            optimum = output_error(
+                shape, records, whole, steps=STEPS, progress=progress, passes=PASSES
+            )
+        except ValueError:
+            return np.inf
+        return float(np.sqrt(optimum.losses[0]))
+
+    return Chosen(_best(FROM_SEVERAL, error), shown)
 
 
 def _slowing(record: Record) -> int:
@@ -169,46 +203,21 @@ def _slowed(record: Record, every: int) -> Record:
     return Record(input, output, every * record.dt, source=record.source)
 
 
-def _error(
-    name: str,
-    records: Sequence[Record],
-    dynamics: HeldDynamics | None,
-    shown: LinearDynamics | None,
-) -> float:
-    """Return the error of the model ``name`` after a short fit to each of ``records``.
+def _error(name: str, record: Record, dynamics: HeldDynamics | None) -> float:
+    """Return the error of the model ``name`` after a short fit to ``record``.
 
-    For a single record it is the standard deviation of the free-run error. With several
-    records, each fit is evaluated on the other records, and the rms error over all of
-    them is returned. The error is infinite if a fit fails, or if the fitted hysteresis
-    has no inverse over the range of the input, because controllers need the inverse.
+    It is the standard deviation of the free-run error. It is infinite if the fit fails,
+    or if the fitted hysteresis has no inverse over the range of the input, because
+    controllers need the inverse.
     """
-    first, *beside = records
-    chain = _chain_of(name, records, dynamics)
-    shape = structure(chain, first, dynamics, beside=beside, shown=shown)
-    if shown is not None:
-        shape = shape._replace(whitening=())  # the dynamics are known already
-    squares = []
-    for record in records:
-        others = [other for other in records if other is not record]
-        every = slice(0, record.samples)
-        try:
-            system = output_error(
-                shape,
-                [record],
-                every,
-                steps=STEPS,
-                own_starts=bool(others),
-                passes=PASSES,
-            ).system
-            hystereses(system)[0].inverse(first.input.min(), first.input.max())
-        except ValueError:
-            return np.inf
-        if not others:
-            run = np.asarray(from_rest(system, as_array(record.input)))
-            return float(np.std(run - record.output))
-        squares += [
-            np.mean((run[:, 0] - other.output) ** 2)
-            for other in others
-            for run in starts_of(system, [other], slice(0, other.samples))[1]
-        ]
-    return float(np.sqrt(np.mean(squares)))
+    chain = _chain_of(name, [record], dynamics)
+    every = slice(0, record.samples)
+    try:
+        system = output_error(
+            structure(chain, record, dynamics), [record], every, steps=STEPS
+        ).system
+        hystereses(system)[0].inverse(record.input.min(), record.input.max())
+    except ValueError:
+        return np.inf
+    run = np.asarray(from_rest(system, as_array(record.input)))
+    return float(np.std(run - record.output))

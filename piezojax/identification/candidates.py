@@ -153,17 +153,25 @@ def first_round(
     tried.
     """
     parts = parts_at("hysteresis")
-    known = [*parts, *(name for name in whole_names() if name != LINEAR)]
+    known = list(dict.fromkeys([*parts, *whole_names()]))
+    known.remove(LINEAR)
     names = known if hysteresis is None else list(hysteresis)
     for name in names:
         if name not in known:
             raise ValueError(
                 f"{name!r} is not a hysteresis model; there are {', '.join(known)}"
             )
-    parts = [name for name in names if name in parts]
+    # One record determines the weights of a Preisach model one by one, or not at all.
+    parts = [
+        name for name in names if name in parts and (name != PLAIN or len(records) > 1)
+    ]
     whole, untried = whole_models(records, train, options)
     whole = [c for c in whole if c.model in (LINEAR, *names)]
-    untried = [excluded for excluded in untried if excluded.model in (LINEAR, *names)]
+    untried = [
+        excluded
+        for excluded in untried
+        if excluded.model in {LINEAR, *names} - set(parts)
+    ]
     if names and {excluded.model for excluded in untried} >= set(names):
         reasons = "; ".join(
             f"{excluded.model}: {excluded.reason}"

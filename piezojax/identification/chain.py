@@ -269,6 +269,14 @@ def structure(
             for bound in (part.bounds[path],)
         },
         whitening=shown.whitening if shown.modes and dynamics is None else (),
+        linear=next(
+            (
+                part.linear._replace(path=f"{place}.{part.linear.path}")
+                for place, part in parts.items()
+                if part.linear
+            ),
+            None,
+        ),
     )
 
 

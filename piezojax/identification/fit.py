@@ -14,6 +14,7 @@ from ..core.conversion import replaced
 from ..core.paths import declared, parameters
 from ..core.progress import Progress, Silent
 from ..core.system import System
+from ..hysteresis.model import hystereses
 from .automatic import automatic
 from .chain import DEFAULT, by_evidence, shown_dynamics
 from .closed_loop import check_approach, feedback_warnings, is_closed
@@ -317,6 +318,7 @@ def identify(
             *estimate.warnings,
             *gains[1],
             *_missed(shown, estimate.linear),
+            *_without_inverse(estimate.system, records),
             *unexplained,
         ],
         alarms=alarms,
@@ -348,6 +350,22 @@ def _missed(shown: LinearDynamics, linear: LinearDetail | None) -> list[str]:
         for mode in shown.modes
         if np.all(np.abs(frequencies / mode.frequency - 1.0) > MISSED)
     ]
+
+
+def _without_inverse(system: System, records: Sequence[Record]) -> list[str]:
+    """Return a warning if a hysteresis of ``system`` has no inverse in the records."""
+    static = [each for each in hystereses(system) if not each.dynamic]
+    if not static or not all(record.single for record in records):
+        return []
+    low, high = (f([f(r.input) for r in records]) for f in (np.min, np.max))
+    try:
+        static[0].inverse(low, high)
+    except ValueError as error:
+        return [
+            f"the hysteresis has no inverse from {low:g} to {high:g} V, but inversion "
+            f"feedforward needs one: {error}"
+        ]
+    return []
 
 
 def _errors(

@@ -54,8 +54,6 @@ Records = Sequence[Record]
 def _by_output_error(
     model: str, records: Records, train: slice, options: Options, progress: Progress
 ) -> Estimate:
-    # A stage whose plant is known was moved before the record.
-    several = len(records) > 1 or options.known is not None
     shown: LinearDynamics | None = None
     if options.known is None and is_closed(records, options):
         found = loop_fit(model, records, train, options, progress)
@@ -78,10 +76,13 @@ def _by_output_error(
             train,
             steps=options.steps,
             progress=progress,
-            own_starts=several,
+            own_starts=options.known is not None,
         )
         found = LoopFit(optimum, optimum.system, shape, text, [])
     system, optimum, shape = found.system, found.optimum, found.shape
+    # A stage whose plant is known was moved before the record; weights need its state.
+    moved = options.known is not None or optimum.weights is not None
+    several = moved or len(records) > 1
     renamed = {BEFORE: INPUT_BEFORE}
     named = {
         renamed.get(name, name.removeprefix(found.inside)): FittedParameter(

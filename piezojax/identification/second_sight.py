@@ -68,7 +68,11 @@ def seen_again(
         kept = set(rough.problem.space.paths) & set(again.space.paths)
         values = {path: get(rough.system, path) for path in kept - set(again.dynamics)}
         start = again.space.nearest(replace(again.system, values))
-        shape = again._replace(starts=start[None], guess=again.starts[0])
+        system = again.system
+        if again.linear:
+            fitted = get(rough.system, again.linear.path)
+            system = replace(system, {again.linear.path: fitted})
+        shape = again._replace(system=system, starts=start[None], guess=again.starts[0])
         if _equal(shown, last):
             break
     return Seen(shape, shown)

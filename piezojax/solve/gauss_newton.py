@@ -240,7 +240,7 @@ def _next_points(
 
 
 def trials_with_models(
-    program: Callable[[Array], tuple[Array, Array, Array]],
+    program: Callable[[Array], tuple[Any, Any, Any]],
     width: int,
     metric: Callable[[np.ndarray], Any] = lambda curvature: 1.0,
 ) -> Callable[[np.ndarray], list[Trials]]:

@@ -467,11 +467,25 @@ MUTATIONS = (
     Mutation(
         "fits of several records that end with their first prior",
         "identification/estimators/output_error.py",
-        "settled = turn > int(cautious) and losses[0] > PASSED * before",
+        "settled = turn > int(alone) and losses[0] > PASSED * before",
         "settled = turn > 0",
         ("tests/identification/test_vague_parameters.py",),
     ),
     # Limits of the reference
+    Mutation(
+        "weights whose prior follows errors that it has made itself",
+        "identification/estimators/linear_weights.py",
+        "min(fit.scale, rms / np.sqrt(independent))",
+        "rms / np.sqrt(independent)",
+        ("tests/identification/test_linear_weights.py",),
+    ),
+    Mutation(
+        "standard errors that take fitted weights for known ones",
+        "identification/estimators/linear_weights.py",
+        "slopes.T @ slopes - crossed.T @ inverse @ crossed,",
+        "slopes.T @ slopes,",
+        ("tests/identification/test_linear_weights.py",),
+    ),
     Mutation(
         "a limited reference that brakes too late",
         "control/limited_reference.py",

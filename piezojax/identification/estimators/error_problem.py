@@ -53,7 +53,7 @@ class Problem(eqx.Module):
         if self.starts is None:
             runs = jax.vmap(lambda input: from_rest(system, input))(self.inputs)
             return runs - self.outputs, jnp.zeros((len(self.inputs), 0))
-        held = self.space.put(self.system, jax.lax.stop_gradient(unit))
+        held = jax.lax.stop_gradient(system)
 
         def one(input, output, weights, start):
             run = run_after(system, input, start.levels).reshape(-1, 1)
@@ -67,13 +67,34 @@ class Problem(eqx.Module):
 
         return jax.vmap(one)(self.inputs, self.outputs, self.weights, self.starts)
 
-    def residuals(self, unit: Float[Array, " n"]) -> Float[Array, " all"]:
-        """Return the weighted errors; their sum of squares is the mean square."""
+    def spread(self, unit: Float[Array, " n"]) -> tuple[float, float]:
+        """Return the rms error, and the number of independent errors.
+
+        The errors are mostly those of the model, not white noise: the number is the
+        participation ratio of their spectrum.
+        """
+        errors = np.asarray(self.errors(unit))
+        counted = np.asarray(self.weights) > 0.0
+        powers = [
+            np.abs(np.fft.rfft(error[used])) ** 2
+            for error, used in zip(errors, counted, strict=True)
+        ]
+        independent = sum(2.0 * np.sum(p) ** 2 / np.sum(p**2) for p in powers)
+        return float(np.sqrt(np.mean(errors[counted] ** 2))), float(independent)
+
+    def residuals(
+        self, unit: Float[Array, " n"], every: int = 1
+    ) -> Float[Array, " all"]:
+        """Return the weighted errors; their sum of squares is the mean square.
+
+        One in ``every`` of them stands for the others.
+        """
         error, unlikely = self._errors_and_starts(unit)
         error = _bounded(error)
-        counted = [self.plain * self.weights * error, unlikely]
+        weights = every**0.5 * self.weights
+        counted = [(self.plain * weights * error)[:, ::every], unlikely]
         if self.whitening.size:
-            counted.append(self.share * self.weights * self.whitened(error))
+            counted.append((self.share * weights * self.whitened(error))[:, ::every])
         if self.prior.size:
             known, weights = self.prior
             counted.append(weights * (unit - known))
@@ -88,6 +109,17 @@ class Problem(eqx.Module):
         for i, tap in enumerate(self.whitening):
             white = white + tap * padded[:, last - error.shape[1] - i : last - i]
         return white
+
+    def weighted(self, weights: Float[Array, "records samples"]) -> "Problem":
+        """Return the problem with other weights of the errors."""
+        return eqx.tree_at(lambda problem: problem.weights, self, weights)
+
+    def only(self, parts: Sequence[slice]) -> "Problem":
+        """Return the problem in which a part of the samples of each record counts."""
+        weights = np.zeros(self.weights.shape)
+        for row, (part, own) in enumerate(zip(parts, self.weights, strict=True)):
+            weights[row, part] = own[part]
+        return self.weighted(as_array(weights / np.sqrt(np.sum(weights**2))))
 
     def balanced(self, unit: Float[Array, " n"]) -> "Problem":
         """Return the problem with equal norms of both kinds of errors at ``unit``."""

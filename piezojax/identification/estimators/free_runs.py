@@ -11,9 +11,13 @@ from ...core.arrays import ScalarLike, as_array
 from ...core.system import System, at_rest, resolve
 from ...engines import run_outputs
 from ..records.record import Record
-from .approach import input_before
+from .approach import TURNS, input_before
 from .linear_start import Start
-from .start_search import start_of
+from .start_search import start_after, start_of
+
+REACHED, LATEST = 0.9, 0.7
+"""Share of the range of an input after which its earlier motions are mostly forgotten,
+and largest share of a record that is left out for this."""
 
 
 def free_run(
@@ -44,7 +48,7 @@ def starts_of(
 
     The starts are estimated for ``system`` on the samples ``train``.
     """
-    ends = np.array([f([f(r.input) for r in records]) for f in (np.min, np.max)])
+    ends = _ends(records)
     found, runs, zeros = [], [], []
     for record in records:
         part = slice(train.start, min(train.stop, record.samples))
@@ -53,6 +57,38 @@ def starts_of(
         runs.append(run)
         zeros.append(float(zero[0]))
     return found, runs, zeros
+
+
+def _ends(records: Sequence[Record]) -> np.ndarray:
+    return np.array([f([f(r.input) for r in records]) for f in (np.min, np.max)])
+
+
+def settled_part(input: np.ndarray, train: slice) -> slice:
+    """Return the samples of ``train`` that depend little on the state before them.
+
+    Most turning points of an earlier motion are forgotten once ``input`` [samples] has
+    moved over REACHED of its range, at the latest after LATEST of the samples.
+    """
+    seen = input[train]
+    reached = np.maximum.accumulate(seen) - np.minimum.accumulate(seen)
+    first = int(np.argmax(reached >= REACHED * np.ptp(seen)))
+    return slice(train.start + min(first, int(LATEST * seen.size)), train.stop)
+
+
+def settled_starts(
+    system: System, records: Sequence[Record], parts: Sequence[slice]
+) -> list[Start]:
+    """Return starts at rest under the first input, one for each record.
+
+    The linear states follow from the samples ``parts`` of each record.
+    """
+    ends = _ends(records)
+    return [
+        start_after(
+            system, r.input, r.output, part, ends, np.repeat(r.input[0], TURNS)
+        )[0]
+        for r, part in zip(records, parts, strict=True)
+    ]
 
 
 def free_runs(

@@ -13,7 +13,7 @@ from ...core.space import Range, space_of
 from ...core.system import Series, series
 from ...dynamics import FirstOrderLag
 from ...hysteresis import Preisach, RateDependentPreisach
-from ...hysteresis.preisach import STARTS
+from ...hysteresis.preisach import STARTS, line_by_line
 from ..records.record import Record
 from .estimate import bound_warning
 from .free_runs import from_rest
@@ -22,7 +22,6 @@ from .preisach_density import (
     empty,
     fit_preisach,
     fit_rate_dependent_preisach,
-    line_by_line,
     responses,
 )
 

@@ -1,6 +1,7 @@
 """Fit of any System to records by its free-run simulation error."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -11,6 +12,7 @@ from jaxtyping import Array, Float
 
 from ...core.arrays import as_array
 from ...core.progress import Progress, Silent
+from ...core.recipe import LinearWeights
 from ...core.space import INSIDE, squash, unsquash
 from ...core.system import System
 from ...solve.gauss_newton import (
@@ -24,7 +26,8 @@ from ...solve.multi_start import Patience, descend
 from ...solve.problem import linearised
 from ..records.record import Record
 from .error_problem import Problem, at_starts, problem_of
-from .free_runs import starts_of
+from .free_runs import settled_part, settled_starts, starts_of
+from .linear_weights import WeightsFit, with_weights
 from .noise_model import NOISE_ORDER
 from .structure import Prior, Structure
 
@@ -75,13 +78,15 @@ class Optimum(NamedTuple):
     """Results of all starts, best first.
 
     ``units`` [starts, n] are points in the unit box, ``losses`` their mean squares.
-    ``finished`` is True if the best descent ended by itself.
+    ``finished`` is True if the best descent ended by itself. ``weights`` are those
+    outside the box, if there are any.
     """
 
     problem: Problem
     units: np.ndarray
     losses: np.ndarray
     finished: bool
+    weights: WeightsFit | None = None
 
     @property
     def system(self) -> System:
@@ -125,11 +130,13 @@ def output_error(
     for the ``own`` and ``slow`` parameters, which these do not determine. The error
     counts over the samples ``train`` of each record; the model sees the input alone,
     from the first sample on, and the input before a single record is fitted with a
-    chain. With several records, or with ``own_starts``, the state
-    before each record and its zero are estimated in place of the structure's ``own``
-    parameters, and the ``vague`` parameters have a weak prior at the first start; its
-    scale follows from the errors of a first fit without it, then of each fit with it.
-    ``passes`` is the largest number of searches for the states, each followed by a fit.
+    chain. With several records, with ``own_starts`` or with ``linear`` weights, the
+    state before each record and its zero are estimated in place of the structure's
+    ``own`` parameters, and the ``vague`` parameters have a weak prior at the first
+    start; its scale follows from the errors of a first fit without it, then of each fit
+    with it. ``passes`` is the largest number of searches for the states, each followed
+    by a fit. With ``linear`` weights, the first fit uses the samples that depend little
+    on the states (``settled_part``) instead.
 
     With a ``noise_model`` the error is that of the prediction by the model and an
     autoregressive model of its errors, which are fitted alternately (Ljung, System
@@ -139,7 +146,7 @@ def output_error(
     simulation.
     """
     progress = progress or Silent()
-    several = own_starts or len(records) > 1
+    several = own_starts or len(records) > 1 or structure.linear is not None
     first = train if several else leading(records[0].input, train)
     if several:
         structure = structure.without(structure.own)
@@ -173,27 +180,32 @@ def output_error(
     progress.stage(f"compiling the fit of {starts.shape[1]} parameters")
     rough = min(steps, ROUGH_STEPS) if whitened or several else steps
     units, losses, finished = _inside(starts), np.zeros(len(starts)), False
-    settled = not several
+    parts = [settled_part(record.input, train) for record in records]
+    whole, settled, weights = problem.weights, not several, None
+    alone = cautious or structure.linear is not None
     for turn in range(passes):
         if several:
             system = problem.space.put(problem.system, as_array(units[0]))
-            found, *_ = starts_of(system, records, train)
+            if turn or structure.linear is None:
+                found, *_ = starts_of(system, records, train)
+                problem = problem.weighted(whole)
+            else:
+                # With the first guess of the weights no state would be right.
+                found = settled_starts(system, records, parts)
+                problem = problem.only(parts)
             problem = at_starts(problem, found)
         if cautious and turn:
             prior = _lighter(prior, _first_guess(structure, problem, units[0]))
             problem = _with_prior(problem, prior)
         last, before = settled or turn == passes - 1, losses[0]
-        units, losses, finished = _descended(
-            problem,
-            _inside(units),
-            width,
-            steps if last and not whitened else rough,
-            progress,
+        limit = steps if last and not whitened else rough
+        problem, units, losses, finished, weights = _descended(
+            problem, structure.linear, weights, _inside(units), width, limit, progress
         )
         if last:
             break
-        # The first fit has no prior: its mean square compares with no other.
-        settled = turn > int(cautious) and losses[0] > PASSED * before
+        # The first fit may have no prior or fewer samples: it compares with no other.
+        settled = turn > int(alone) and losses[0] > PASSED * before
     before = np.inf
     for _ in range(NOISE_PASSES if noise_model else int(whitened)):
         point = as_array(units[0])
@@ -207,15 +219,16 @@ def output_error(
             again = units.copy()
             again[:, dynamics] = starts[0, dynamics]
             units = np.concatenate([again, units])[: len(units) + 1]
-        units, losses, finished = _descended(
-            problem, _inside(units), width, steps, progress
+        problem, units, losses, finished, weights = _descended(
+            problem, structure.linear, weights, _inside(units), width, steps, progress
         )
         if abs(before - losses[0]) <= NOISE_SETTLED * losses[0]:
             break
         before = losses[0]
     if cautious:
         problem = _with_prior(problem, none)  # errors are those of the records alone
-    return Optimum(problem, units, losses, finished)
+        weights = weights and weights._replace(problem=problem)
+    return Optimum(problem, units, losses, finished, weights)
 
 
 def _with_prior(problem: Problem, prior: Prior) -> Problem:
@@ -237,20 +250,11 @@ def _first_guess(structure: Structure, problem: Problem, unit: np.ndarray) -> Pr
 
     Two records may not determine each weight of a hysteresis: without the prior, a
     third record, with another history, has errors many times as large.
-    The errors at ``unit`` are mostly those of the model, not white noise: the number of
-    independent ones is the participation ratio of their spectrum.
     """
-    errors = np.asarray(problem.errors(as_array(unit)))
-    counted = np.asarray(problem.weights) > 0.0
-    powers = [
-        np.abs(np.fft.rfft(error[used])) ** 2
-        for error, used in zip(errors, counted, strict=True)
-    ]
-    independent = sum(2.0 * np.sum(p) ** 2 / np.sum(p**2) for p in powers)
-    rms = float(np.sqrt(np.mean(errors[counted] ** 2)))
+    rms, independent = problem.spread(as_array(unit))
     spread = [structure.vague.get(path, np.inf) for path in structure.space.paths]
     known = structure.starts[0] if structure.guess is None else structure.guess
-    return Prior(known, rms / (np.array(spread) * float(np.sqrt(independent))))
+    return Prior(known, rms / (np.array(spread) * np.sqrt(independent)))
 
 
 def _inside(units: np.ndarray) -> np.ndarray:
@@ -258,17 +262,30 @@ def _inside(units: np.ndarray) -> np.ndarray:
 
 
 def _descended(
-    problem: Problem, starts: np.ndarray, width: int, steps: int, progress: Progress
-) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Return the best points, their losses, and whether the best descent has ended.
+    problem: Problem,
+    linear: LinearWeights | None,
+    before: WeightsFit | None,
+    starts: np.ndarray,
+    width: int,
+    steps: int,
+    progress: Progress,
+) -> Optimum:
+    """Return the optimum from ``starts``, that of the ``linear`` weights included.
 
-    ``width`` starts descend together, and at most as many points are returned. Raises
-    ValueError if no start leads to a finite simulation.
+    ``before`` is an earlier fit of these weights. ``width`` starts descend together,
+    and at most as many points are returned. Raises ValueError if no start leads to a
+    finite simulation.
     """
-    evaluate = trials_with_models(lambda free: _normal_equations(problem, free), width)
+    firsts = as_array(np.asarray(unsquash(as_array(starts))))
+    scale = before.scale if before else np.inf
+    weights = linear and with_weights(problem, linear, firsts[0], scale)
+    equations = partial(_normal_equations, problem)
+    evaluate = trials_with_models(
+        weights.normal_equations if weights else equations, width
+    )
     descents = [
         Descent(start, TRUST_REGION, tolerance=TOLERANCE)
-        for start in np.asarray(unsquash(as_array(starts)))
+        for start in np.asarray(firsts)
     ]
     progress.stage(f"fitting from {len(starts)} starts", steps)
     status, finished = descend(
@@ -286,7 +303,10 @@ def _descended(
             "no start led to a finite simulation of the record: check its columns and "
             "units, or fit another model"
         )
-    return units, losses, finished
+    if weights:
+        weights = weights.best_at(unsquash(as_array(units[0])), weights.scale)
+        problem = weights.problem
+    return Optimum(problem, units, losses, finished, weights)
 
 
 @eqx.filter_jit
@@ -323,7 +343,10 @@ def values_and_errors(optimum: Optimum) -> tuple[np.ndarray, list[float | None]]
     best = as_array(np.asarray(free)[0])
     values, slopes = map(np.asarray, _parameters(problem, best))
     # All points, because the program of the descents is compiled for their number.
-    curvature = np.asarray(_normal_equations(problem, free)[2])[0]
+    if optimum.weights:
+        curvature = optimum.weights.normal_equations(best[None])[2][0]
+    else:
+        curvature = np.asarray(_normal_equations(problem, free)[2])[0]
     slopes = np.where(slopes == 0.0, 1.0, slopes)
     kinds = 2 if problem.whitening.size and float(problem.plain) else 1
     counted = kinds * int(np.sum(np.asarray(problem.weights) > 0))

@@ -13,12 +13,15 @@ from ...core.rollout import simulate
 from ...core.system import System
 from ...dynamics import ARMA
 from ...hysteresis import Preisach, RateDependentPreisach
-from ...hysteresis.preisach import Levels, PlayLines
+from ...hysteresis.preisach import (
+    LEAST_SLOPE,
+    Levels,
+    PlayLines,
+    line_by_line,
+    neighbours,
+)
 from ...hysteresis.rate_dependent_preisach import fast_share
 from ..records.record import Record
-
-LEAST_SLOPE = 0.01
-"""Least slope after a turn, as a share of the record's mean slope: see fit_preisach."""
 
 
 def fit_preisach(
@@ -133,7 +136,7 @@ def _densities(
     least[:cells] = LEAST_SLOPE * slope * float(slow.high - slow.low) / cells
     least = np.tile(least, count)
     centre = rows.mean(axis=0)
-    rough = smoothing * np.sqrt(wanted.size) * _differences(places)
+    rough = smoothing * np.sqrt(wanted.size) * neighbours(places)
     rough = np.kron(np.eye(count), rough)
     matrix = np.vstack([rows - centre, rough])
     right = np.append(wanted - wanted.mean(), np.zeros(len(rough))) - matrix @ least
@@ -152,11 +155,6 @@ def _densities(
 
 def _slow(shape: Preisach | RateDependentPreisach) -> Preisach:
     return shape.slow if isinstance(shape, RateDependentPreisach) else shape
-
-
-def line_by_line(cells: int) -> list[tuple[int, int]]:
-    """Return the cells in the order of ``responses``: that of PlayLines."""
-    return [(j + k, j) for k in range(cells) for j in range(cells - k)]
 
 
 class _Memory(System):
@@ -212,20 +210,3 @@ def _passed(signals: np.ndarray, dynamics: ARMA | None) -> np.ndarray:
     past = [1.0, *(-float(a) for a in dynamics.autoregressive)]
     rest = float(dynamics.dc_gain()) * signals[0]
     return scipy.signal.lfilter(moving, past, signals - signals[0], axis=0) + rest
-
-
-def _differences(places: list[tuple[int, int]]) -> np.ndarray:
-    """Return the matrix of differences between neighbours off the diagonal.
-
-    The diagonal, which has no hysteresis, is smoothed only along itself.
-    """
-    index = {place: at for at, place in enumerate(places)}
-    rows = []
-    for (i, j), at in index.items():
-        for other in ((i + 1, j), (i, j + 1), (i + 1, j + 1)):
-            within = (i == j) == (other[0] == other[1])
-            if other in index and within:
-                row = np.zeros(len(places))
-                row[[at, index[other]]] = -1.0, 1.0
-                rows.append(row)
-    return np.array(rows).reshape(-1, len(places))

@@ -234,6 +234,18 @@ def start_of(
     ``levels_before``.
     """
     levels = levels_before(system, inputs, outputs, part, ranges)
+    return start_after(system, inputs, outputs, part, ranges, levels)
+
+
+def start_after(
+    system: System,
+    inputs: np.ndarray,
+    outputs: np.ndarray,
+    part: slice,
+    ranges: np.ndarray,
+    levels: np.ndarray,
+) -> tuple[Start, np.ndarray, np.ndarray]:
+    """Return what ``start_of`` does, for known ``levels`` [TURNS, m]."""
     y = outputs.reshape(len(outputs), -1)
     counted = np.zeros(len(y))
     counted[part] = 1.0

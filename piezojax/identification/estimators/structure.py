@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ...core.recipe import LinearWeights
 from ...core.space import Range, Space, space_of
 from ...core.system import Series, System, series
 from .approach import BEFORE, Before
@@ -39,6 +40,7 @@ class Structure(NamedTuple):
     which are largest at low frequencies. ``prior`` is that of the parameters, if any.
     ``weights`` are those of the errors of each record, by default equal. ``guess`` [n]
     is the first guess of the vague parameters in the unit box, if no start has it.
+    ``linear`` are weights outside the box, as in Recipe.
     """
 
     system: System
@@ -52,6 +54,7 @@ class Structure(NamedTuple):
     prior: Prior | None = None
     weights: tuple[float, ...] = ()
     guess: np.ndarray | None = None
+    linear: LinearWeights | None = None
 
     def weight(self, record: int) -> float:
         """Return the weight of the errors of a record."""

@@ -1,0 +1,179 @@
+"""Preisach weights in chains of any parts, against relays in a NumPy loop."""
+
+import itertools
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles.preisach import Lines
+
+import piezojax as pj
+from piezojax.core.space import squash, unsquash
+from piezojax.identification.chain import structure
+from piezojax.identification.estimators.approach import TURNS
+from piezojax.identification.estimators.error_problem import at_starts, problem_of
+from piezojax.identification.estimators.free_runs import starts_of
+from piezojax.identification.estimators.linear_start import Start
+from piezojax.identification.estimators.linear_weights import with_weights
+from piezojax.identification.estimators.output_error import (
+    output_error,
+    values_and_errors,
+)
+from piezojax.identification.records.record import Record
+
+DT, SAMPLES, NOISE, LAG = 1e-3, 600, 2e-3, 4e-3
+MODEL = "preisach+lag"
+CELLS, LOW, HIGH = 12, 0.0, 100.0
+
+
+def density():
+    """Return rough weights (um), the more of them the nearer to the diagonal."""
+    random = np.random.default_rng(4)
+    places = np.arange(CELLS)
+    apart = (places[:, None] - places) / CELLS
+    weights = np.tril(random.gamma(2.0, size=(CELLS, CELLS)) * np.exp(-3.0 * apart))
+    np.fill_diagonal(weights, 10.0)
+    return 12.0 * weights / weights.sum()
+
+
+def drive(kind):
+    """Return the input of a record: swings of changing height, or steps."""
+    time = DT * np.arange(SAMPLES)
+    random = np.random.default_rng(7)
+    if kind == "steps":
+        return np.repeat(random.uniform(12.0, 88.0, SAMPLES // 30), 30)
+    height = np.repeat(random.uniform(8.0, 42.0, SAMPLES // 50), 50)
+    height[100:150] = 42.0
+    return 50.0 - height * np.cos(2.0 * np.pi * float(kind) * time)
+
+
+def record_of(kind, levels, zero, seed):
+    """Return a record of relays and a lag after a motion from 0 V over ``levels``."""
+    u = drive(kind)
+    ends = (0.0, *levels, u[0])
+    before = np.concatenate(
+        [np.linspace(*pair, 300) for pair in itertools.pairwise(ends)]
+    )
+    path = np.concatenate([before, u])
+    relays = Lines(density(), LOW, HIGH, 0.0)
+    motion = np.empty(path.size)
+    for k, each in enumerate(path):
+        motion[k] = relays.output(each)
+        relays.w = relays.moved(each)
+    share, tip = 1.0 - np.exp(-DT / LAG), [motion[0]]
+    for each in motion[:-1]:
+        tip.append(tip[-1] + share * (each - tip[-1]))
+    y = np.array(tip)[before.size :]
+    noise = NOISE * np.random.default_rng(seed).standard_normal(SAMPLES)
+    return Record(u, y + zero + noise, DT, source=kind)
+
+
+PAST = {"10": (90.0, 20.0), "6": (60.0, 4.0, 70.0), "steps": (30.0, 95.0)}
+
+
+@pytest.fixture(scope="module")
+def records():
+    return [
+        record_of(kind, past, zero, seed)
+        for seed, (zero, (kind, past)) in enumerate(
+            zip((1.0, -2.0, 3.0), PAST.items(), strict=True)
+        )
+    ]
+
+
+def fitted(records):
+    shape = structure(MODEL, records[0], beside=records[1:])
+    whole = slice(0, SAMPLES)
+    return output_error(shape, records, whole, steps=24, passes=4)
+
+
+def test_two_records_determine_a_density_and_the_lag_behind_it(records):
+    found = fitted(records[:2])
+    weights = np.asarray(found.system.parts[0].weights)
+    assert (weights >= 0.0).all() and not np.triu(weights, 1).any()
+    (lag,), (error,) = values_and_errors(found)
+    assert lag == pytest.approx(LAG, rel=0.01)
+    assert lag == pytest.approx(LAG, abs=5.0 * error)
+    # The turning points of the third record are others.
+    _, (run,), _ = starts_of(found.system, records[2:], slice(0, SAMPLES))
+    error = np.std(run[:, 0] - records[2].output)
+    assert error < 0.003 * np.ptp(records[2].output)
+
+
+def test_one_record_has_a_past_too(records):
+    found = fitted(records[:1])
+    _, (run,), _ = starts_of(found.system, records[:1], slice(0, SAMPLES))
+    assert np.std(run[:, 0] - records[0].output) < 2.0 * NOISE
+    (lag,), _ = values_and_errors(found)
+    assert lag == pytest.approx(LAG, rel=0.02)
+
+
+@pytest.fixture(scope="module")
+def problem(records):
+    shape = structure(MODEL, records[0], beside=records[1:2])
+    shape = shape.without(shape.own)
+    whole = slice(0, SAMPLES)
+    ends = jnp.array([5.0, 95.0])
+    # At rest, with so large a variance that the state of the lag is not corrected: its
+    # effect depends on the weights and the lag, and is not differentiated.
+    found = [
+        Start(jnp.full(TURNS, r.input[0]), ends, jnp.asarray(1e9)) for r in records[:2]
+    ]
+    return shape, at_starts(problem_of(shape, records[:2], whole), found)
+
+
+def free(shape):
+    return unsquash(jnp.asarray(shape.starts[0]))
+
+
+def test_the_gradient_is_that_of_the_loss_with_the_best_weights(problem):
+    shape, known = problem
+    at = free(shape)
+    fit = with_weights(known, shape.linear, at)
+    step = 1e-4
+    points = jnp.stack([at, at - step, at + step])
+    loss, gradient, curvature = fit.normal_equations(points)
+    slope = (loss[2] - loss[1]) / (2.0 * step)
+    assert gradient[0, 0] == pytest.approx(slope, rel=1e-5)
+    bend = (gradient[2, 0] - gradient[1, 0]) / (2.0 * step)
+    # Gauss-Newton leaves out the second derivative of the errors.
+    assert curvature[0, 0, 0] == pytest.approx(bend, rel=0.3)
+
+
+def test_weights_that_change_too_make_a_parameter_less_certain(problem):
+    shape, known = problem
+    at = free(shape)
+    fit = with_weights(known, shape.linear, at)
+    held = fit._replace(above=np.zeros_like(fit.above))
+    joint, fixed = (each.normal_equations(at[None])[2][0, 0, 0] for each in (fit, held))
+    assert 0.0 < joint < 0.9 * fixed
+
+
+def test_best_weights_leave_no_better_ones_nearby(problem):
+    shape, known = problem
+    at = free(shape)
+    fit = with_weights(known, shape.linear, at)
+    errors = np.asarray(fit.problem.residuals(squash(at)))
+    rough = fit.smoothing @ (shape.linear.least + fit.above)
+    slope = fit.effects.T @ errors + fit.smoothing.T @ rough
+    # A weight at its bound would have to fall, the others are stationary.
+    assert (slope[fit.above == 0.0] > -1e-9).all()
+    assert np.abs(slope[fit.above > 0.0]).max() < 1e-9
+    loss, _, _ = fit.normal_equations(at[None])
+    assert loss[0] == pytest.approx(0.5 * (errors @ errors + rough @ rough))
+
+
+def test_a_heavier_prior_never_follows_a_lighter_one(problem):
+    shape, known = problem
+    at = free(shape)
+    first = with_weights(known, shape.linear, at)
+    assert with_weights(known, shape.linear, at, 0.1 * first.scale).scale == (
+        pytest.approx(0.1 * first.scale)
+    )
+
+
+def test_one_in_several_errors_stands_for_the_others(problem):
+    shape, known = problem
+    unit = jnp.asarray(shape.starts[0])
+    every, some = (float(np.sum(known.residuals(unit, n) ** 2)) for n in (1, 4))
+    assert some == pytest.approx(every, rel=0.05)
