@@ -246,7 +246,7 @@ def record():
 
 
 @pytest.mark.parametrize(
-    "name", ["krasnoselskii", "", "ColemanHodgdon", "lag+preisach"]
+    "name", ["krasnoselskii", "", "ColemanHodgdon", "lag+bouc_wen"]
 )
 def test_unknown_model(record, name):
     part = name.split("+")[-1]
