@@ -13,6 +13,7 @@ from pydantic import BaseModel
 from ..core.about import About
 from ..core.error_bound import ErrorBound
 from ..core.system import System, accepts, rest_output
+from .estimators.free_runs import first_covering
 from .estimators.projection import excited_columns
 from .estimators.start_search import start_of
 from .fit import POOR, unexplained_share
@@ -265,10 +266,8 @@ def default_part(record: Record) -> slice:
         min(most, max(1, round(share * record.samples)))
         for most, share in zip(MOST, (SHARE, LATEST), strict=True)
     )
-    inputs = record.inputs
-    reached = np.maximum.accumulate(inputs) - np.minimum.accumulate(inputs)
-    enough = np.all(reached >= COVERED * np.ptp(inputs, axis=0), axis=1)
-    return slice(0, max(first, min(last, int(np.argmax(enough)) + 1)))
+    covered = first_covering(record.inputs, COVERED)
+    return slice(0, max(first, min(last, covered + 1)))
 
 
 def _signals(system: System, record: Record) -> np.ndarray:

@@ -471,7 +471,6 @@ MUTATIONS = (
         "settled = turn > 0",
         ("tests/identification/test_vague_parameters.py",),
     ),
-    # Limits of the reference
     Mutation(
         "weights whose prior follows errors that it has made itself",
         "identification/estimators/linear_weights.py",
@@ -486,6 +485,7 @@ MUTATIONS = (
         "slopes.T @ slopes,",
         ("tests/identification/test_linear_weights.py",),
     ),
+    # Limits of the reference
     Mutation(
         "a limited reference that brakes too late",
         "control/limited_reference.py",

@@ -63,6 +63,16 @@ def _ends(records: Sequence[Record]) -> np.ndarray:
     return np.array([f([f(r.input) for r in records]) for f in (np.min, np.max)])
 
 
+def first_covering(inputs: Float[np.ndarray, "n m"], share: float) -> int:
+    """Return the sample from which each input has covered ``share`` of its range.
+
+    It is 0 without such a sample.
+    """
+    reached = np.maximum.accumulate(inputs) - np.minimum.accumulate(inputs)
+    enough = np.all(reached >= share * np.ptp(inputs, axis=0), axis=1)
+    return int(np.argmax(enough))
+
+
 def settled_part(input: np.ndarray, train: slice) -> slice:
     """Return the samples of ``train`` that depend little on the state before them.
 
@@ -70,8 +80,7 @@ def settled_part(input: np.ndarray, train: slice) -> slice:
     moved over REACHED of its range, at the latest after LATEST of the samples.
     """
     seen = input[train]
-    reached = np.maximum.accumulate(seen) - np.minimum.accumulate(seen)
-    first = int(np.argmax(reached >= REACHED * np.ptp(seen)))
+    first = first_covering(seen[:, None], REACHED)
     return slice(train.start + min(first, int(LATEST * seen.size)), train.stop)
 
 

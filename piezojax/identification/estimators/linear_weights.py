@@ -73,18 +73,11 @@ class WeightsFit(NamedTuple):
 
     def best_at(self, free: Float[Array, " n"], scale: float) -> "WeightsFit":
         """Return the fit with the best weights at ``free`` for a ``scale``."""
-        import scipy.optimize  # takes long to import
-
         smoothing = scale * self.linear.differences
         least, (_, errors) = self.linear.least, self._linearised(free)
         rows = np.concatenate([self.effects, smoothing])
         right = np.append(self.effects @ self.above - errors, -smoothing @ least)
-        # The triangular factor gives the same solution with fewer rows.
-        both = np.column_stack([rows, right])
-        small = np.asarray(np.linalg.qr(both, mode="r"))
-        above, _ = scipy.optimize.nnls(
-            small[:, :-1], small[:, -1], maxiter=100 * least.size
-        )
+        above = nonnegative(rows, right)
         weights = np.array(get(self.problem.system, self.linear.path))
         weights[self.linear.places] = least + above
         problem = _replaced(self.problem, self.linear.path, as_array(weights))
@@ -96,6 +89,19 @@ class WeightsFit(NamedTuple):
         found = _linearised(self.problem, free, _every(self.problem))
         slopes, errors = map(np.asarray, found)
         return slopes, errors
+
+
+def nonnegative(
+    matrix: Float[np.ndarray, "rows k"], right: Float[np.ndarray, " rows"]
+) -> Float[np.ndarray, " k"]:
+    """Return the least squares solution of at least 0 for many rows."""
+    import scipy.optimize  # takes long to import
+
+    # The triangular factor gives the same solution with fewer rows.
+    both = np.column_stack([matrix, right])
+    small = np.asarray(np.linalg.qr(both, mode="r"))
+    unknowns = matrix.shape[1]
+    return scipy.optimize.nnls(small[:, :-1], small[:, -1], maxiter=100 * unknowns)[0]
 
 
 def with_weights(

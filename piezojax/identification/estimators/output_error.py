@@ -276,17 +276,14 @@ def _descended(
     and at most as many points are returned. Raises ValueError if no start leads to a
     finite simulation.
     """
-    firsts = as_array(np.asarray(unsquash(as_array(starts))))
+    firsts = np.asarray(unsquash(as_array(starts)))
     scale = before.scale if before else np.inf
-    weights = linear and with_weights(problem, linear, firsts[0], scale)
+    weights = linear and with_weights(problem, linear, as_array(firsts[0]), scale)
     equations = partial(_normal_equations, problem)
     evaluate = trials_with_models(
         weights.normal_equations if weights else equations, width
     )
-    descents = [
-        Descent(start, TRUST_REGION, tolerance=TOLERANCE)
-        for start in np.asarray(firsts)
-    ]
+    descents = [Descent(start, TRUST_REGION, tolerance=TOLERANCE) for start in firsts]
     progress.stage(f"fitting from {len(starts)} starts", steps)
     status, finished = descend(
         GaussNewton(descents, evaluate),
@@ -342,10 +339,10 @@ def values_and_errors(optimum: Optimum) -> tuple[np.ndarray, list[float | None]]
     problem, free = optimum.problem, unsquash(as_array(optimum.units))
     best = as_array(np.asarray(free)[0])
     values, slopes = map(np.asarray, _parameters(problem, best))
-    # All points, because the program of the descents is compiled for their number.
     if optimum.weights:
         curvature = optimum.weights.normal_equations(best[None])[2][0]
     else:
+        # All points, because the program of the descents is compiled for their number.
         curvature = np.asarray(_normal_equations(problem, free)[2])[0]
     slopes = np.where(slopes == 0.0, 1.0, slopes)
     kinds = 2 if problem.whitening.size and float(problem.plain) else 1

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from scipy.optimize import nnls
 
 from ...core.arrays import State, as_array
 from ...core.rollout import simulate
@@ -22,6 +21,7 @@ from ...hysteresis.preisach import (
 )
 from ...hysteresis.rate_dependent_preisach import fast_share
 from ..records.record import Record
+from .linear_weights import nonnegative
 
 
 def fit_preisach(
@@ -140,10 +140,7 @@ def _densities(
     rough = np.kron(np.eye(count), rough)
     matrix = np.vstack([rows - centre, rough])
     right = np.append(wanted - wanted.mean(), np.zeros(len(rough))) - matrix @ least
-    # The triangular factor gives the same solution with fewer rows.
-    both = np.column_stack([matrix, right])
-    small = np.asarray(np.linalg.qr(both, mode="r"))
-    found = least + nnls(small[:, :-1], small[:, -1], maxiter=100 * least.size)[0]
+    found = least + nonnegative(matrix, right)
     densities = []
     for own in np.split(found, count):
         weights = np.zeros((cells, cells))
