@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from oracles.preisach import Lines
 
-import piezojax as pj
 from piezojax.core.space import squash, unsquash
 from piezojax.identification.chain import structure
 from piezojax.identification.estimators.approach import TURNS
