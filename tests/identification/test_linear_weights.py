@@ -89,7 +89,8 @@ def fitted(records):
 def test_two_records_determine_a_density_and_the_lag_behind_it(records):
     found = fitted(records[:2])
     weights = np.asarray(found.system.parts[0].weights)
-    assert (weights >= 0.0).all() and not np.triu(weights, 1).any()
+    assert (weights >= 0.0).all()
+    assert not np.triu(weights, 1).any()
     (lag,), (error,) = values_and_errors(found)
     assert lag == pytest.approx(LAG, rel=0.01)
     assert lag == pytest.approx(LAG, abs=5.0 * error)
