@@ -14,7 +14,7 @@ RECORD = Record(INPUT, 0.1 * INPUT, 1e-3)
 
 
 def stage(height):
-    """Return a friction whose slope after a turn is 1 - 2 height / (5 V) of the gain."""
+    """Return a friction whose slope after a turn is 1 - 0.4 height of the gain."""
     friction = DahlFrictions((0.1,), (height,), (0.2,), (1.0,))
     return pj.series(hysteresis=friction, lag=FirstOrderLag(2e-3, 1e-3))
 
