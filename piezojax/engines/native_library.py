@@ -3,6 +3,7 @@
 import ctypes
 import functools
 import hashlib
+import platform
 import shutil
 import subprocess
 import tempfile
@@ -19,12 +20,20 @@ from ..core.files import write_bytes
 from ..core.profile import COMPILING_C, stage
 from ..core.runtime import processor
 
+WIDE = ("-mprefer-vector-width=512",)
+"""Flag for processors with AVX-512, without effect on other x86 processors.
+
+gcc writes functions with the attribute ``simd`` for the widest vectors alone. Loops
+over narrower vectors, its choice for some processors, would call them for each lane:
+the Jacobian of three Dahl frictions would take 3.5 times as long."""
+
 FLAGS = (
     *("-std=gnu11", "-march=native", "-fPIC", "-shared", "-w", "-ftree-vectorize"),
     # The code needs neither errno nor floating-point traps.
     *("-fno-math-errno", "-fno-trapping-math"),
     # Without it gcc gives up SIMD in a loop that reads or writes more than 1000 arrays.
     "--param=loop-max-datarefs-for-datadeps=100000",
+    *(WIDE if platform.machine() in ("x86_64", "AMD64") else ()),
 )
 
 QUICK = 2000
