@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -29,9 +30,12 @@ wiped out, and with a memory that decays along the input."""
 PLAYS = HYSTERESES[1]
 """The one of them behind which the dynamics are looked at."""
 
-FROM_SEVERAL = (*HYSTERESES[:2], "dahl_frictions", "preisach")
-"""The same for several records: they determine the bends of several frictions, and the
-density of a Preisach model."""
+FROM_SEVERAL = (*HYSTERESES[:2], "dahl_frictions")
+"""The same for several records: they determine the bends of several frictions."""
+
+DENSITY = "preisach"
+"""Model of several records if its error is clearly smaller than that of the best other
+one: a density describes many loops, and its fit takes minutes."""
 
 CREEP = "exponential_creep"
 """Creep of the default model."""
@@ -78,7 +82,7 @@ def automatic(
 
     The hysteresis is the first of ``HYSTERESES``, or ``FROM_SEVERAL``, unless another
     one has a clearly smaller error (``CLEARLY``) after a short fit to ``record`` and
-    those ``beside`` it together.
+    those ``beside`` it together; ``DENSITY`` must be clearly better than all of them.
     The fits use the first samples of a long record (``leading``), those to a single one
     also a lower sampling rate if it resolves the resonances and the input.
     With ``dynamics``, which are held, the chain has no other dynamics.
@@ -144,6 +148,7 @@ def _for_several(
         with contextlib.suppress(ValueError):
             shown = seen_again(plays, records, whole, progress, looks=LOOKS).shown
 
+    @cache
     def error(name: str) -> float:
         """Return the rms error after a short fit to all records, infinite if it fails.
 
@@ -162,7 +167,7 @@ def _for_several(
             return np.inf
         return float(np.sqrt(optimum.losses[0]))
 
-    return Chosen(_best(FROM_SEVERAL, error), shown)
+    return Chosen(_best((_best(FROM_SEVERAL, error), DENSITY), error), shown)
 
 
 def _slowing(record: Record) -> int:

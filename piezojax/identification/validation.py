@@ -15,7 +15,7 @@ from ..core.error_bound import ErrorBound
 from ..core.system import System, accepts, rest_output
 from .estimators.free_runs import first_covering
 from .estimators.projection import excited_columns
-from .estimators.start_search import start_of
+from .estimators.start_search import cautious_start_of
 from .fit import POOR, unexplained_share
 from .records.record import LARGEST, Record
 from .residuals.bound import joined
@@ -201,7 +201,7 @@ def _judged(
     part = _part(record, estimate)
     rest = slice(part.stop, record.samples)
     inputs = _signals(system, record)
-    start, run, zero = start_of(
+    start, run, zero = cautious_start_of(
         system, inputs, record.outputs, part, _ranges(inputs, about)
     )
     run = np.where(np.abs(run) < LARGEST, run, np.nan)

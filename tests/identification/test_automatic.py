@@ -1,9 +1,19 @@
 """Trials that choose the hysteresis of a default model: their records and rates."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from piezojax.identification.automatic import SAMPLES, VARIATION, _slowed, _slowing
+import piezojax.identification.automatic as automatic
+from piezojax.identification.automatic import (
+    DENSITY,
+    FROM_SEVERAL,
+    SAMPLES,
+    VARIATION,
+    _slowed,
+    _slowing,
+)
 from piezojax.identification.records.record import Record
 
 DT = 5e-5
@@ -42,3 +52,40 @@ def test_the_delay_remains_one_sample_of_the_record(every):
     later = record.output[1:][inside] - record.input[:-1][inside]
     assert np.abs(later).max() < 2e-3
     assert record.dt == every * DT
+
+
+CURVE, PLAYS, FRICTIONS = FROM_SEVERAL
+
+
+@pytest.mark.parametrize(
+    ("errors", "best"),
+    [
+        ((10.0, 8.1, 9.0, 8.05), CURVE),
+        ((10.0, 7.0, 7.5, 5.7), PLAYS),
+        ((10.0, 7.5, 7.0, 5.7), FRICTIONS),
+        ((10.0, 7.5, 7.0, 5.5), DENSITY),
+        ((10.0, 7.5, None, 7.0), PLAYS),
+        ((10.0, None, None, None), CURVE),
+    ],
+)
+def test_a_hysteresis_of_more_parameters_must_be_clearly_better(
+    errors, best, monkeypatch
+):
+    """The ``errors`` of the short fits are given; None if one fails."""
+    known = dict(zip((*FROM_SEVERAL, DENSITY), errors, strict=True))
+
+    def output_error(name, *_, **__):
+        if known[name] is None:
+            raise ValueError("no start led to a finite simulation")
+        return SimpleNamespace(losses=[known[name] ** 2])
+
+    def seen_again(*_, **__):
+        raise ValueError("plays do not fit")
+
+    monkeypatch.setattr(automatic, "seen_again", seen_again)
+    monkeypatch.setattr(automatic, "output_error", output_error)
+    monkeypatch.setattr(
+        automatic, "structure", lambda chain, *_, **__: chain.partition("+")[0]
+    )
+    records = [record_of(CYCLES), record_of(0.9 * CYCLES)]
+    assert automatic.hysteresis_for(records).model == best

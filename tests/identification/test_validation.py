@@ -10,10 +10,10 @@ from oracles import hysteresis
 import piezojax as pj
 from piezojax.core.about import About
 from piezojax.core.error_bound import ErrorBound
-from piezojax.dynamics import FirstOrderLag, StateSpace
+from piezojax.dynamics import ExponentialCreep, FirstOrderLag, StateSpace
 from piezojax.hysteresis import PrandtlIshlinskii
 from piezojax.identification import Record, free_run, validate
-from piezojax.identification.estimators.start_search import start_of
+from piezojax.identification.estimators.start_search import cautious_start_of, start_of
 from piezojax.identification.validation import default_part
 
 DT, NOISE = 1e-4, 2e-3
@@ -115,6 +115,26 @@ def test_three_turns_beyond_the_range_of_the_record_are_found(low, high, determi
     assert start.levels[1:] == pytest.approx([33.0, 58.0], abs=0.3)
     if determined:
         assert zero == pytest.approx([0.0], abs=NOISE)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+def test_slow_errors_of_a_model_are_not_taken_for_creep(seed):
+    # Plays that are 10 % too small leave slow errors. The stage does not creep, but the
+    # creep of the model, 1 % for each time, could explain them in the first part.
+    plays = PrandtlIshlinskii(
+        (SLOPE,), THRESHOLDS, tuple(0.9 * weight for weight in WEIGHTS), 0.0
+    )
+    creep = ExponentialCreep((0.01,) * 3, (0.02, 0.2, 2.0), DT)
+    model = pj.series(hysteresis=plays, creep=creep, dynamics=FirstOrderLag(TAU, DT))
+    u = excitation(seed=seed)
+    y, part, ends = moved(u) + 0.7, slice(0, 1200), np.array([10.0, 90.0])
+    plain, cautious = (
+        np.sqrt(
+            np.mean((estimate(model, u, y, part, ends)[1][1200:, 0] - y[1200:]) ** 2)
+        )
+        for estimate in (start_of, cautious_start_of)
+    )
+    assert cautious < 0.8 * plain
 
 
 def test_the_state_is_estimated_until_the_input_has_covered_its_range():

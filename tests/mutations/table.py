@@ -472,6 +472,13 @@ MUTATIONS = (
         ("tests/identification/test_vague_parameters.py",),
     ),
     Mutation(
+        "states before a record in which every sample counts",
+        "identification/estimators/start_search.py",
+        "samples = errors.size / independent(errors)",
+        "samples = 1.0",
+        ("tests/identification/test_validation.py",),
+    ),
+    Mutation(
         "weights whose prior follows errors that it has made itself",
         "identification/estimators/linear_weights.py",
         "min(fit.scale, rms / np.sqrt(independent))",

@@ -15,7 +15,7 @@ from ..records.record import Record
 from .approach import run_after
 from .free_runs import from_rest
 from .linear_start import Start, most_likely, start_columns
-from .noise_model import NOISE_ORDER, whitening_filter
+from .noise_model import NOISE_ORDER, independent, whitening_filter
 from .structure import Structure
 
 
@@ -70,17 +70,13 @@ class Problem(eqx.Module):
     def spread(self, unit: Float[Array, " n"]) -> tuple[float, float]:
         """Return the rms error, and the number of independent errors.
 
-        The errors are mostly those of the model, not white noise: the number is the
-        participation ratio of their spectrum.
+        The errors are mostly those of the model, not white noise.
         """
         errors = np.asarray(self.errors(unit))
         counted = np.asarray(self.weights) > 0.0
-        powers = [
-            np.abs(np.fft.rfft(error[used])) ** 2
-            for error, used in zip(errors, counted, strict=True)
-        ]
-        independent = sum(2.0 * np.sum(p) ** 2 / np.sum(p**2) for p in powers)
-        return float(np.sqrt(np.mean(errors[counted] ** 2))), float(independent)
+        each = [error[used] for error, used in zip(errors, counted, strict=True)]
+        rms = np.sqrt(np.mean(np.concatenate(each) ** 2))
+        return float(rms), sum(independent(error) for error in each)
 
     def residuals(
         self, unit: Float[Array, " n"], every: int = 1

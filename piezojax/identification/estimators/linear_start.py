@@ -88,7 +88,7 @@ class Start(eqx.Module):
 
     ``ends`` are the ends of the range of the inputs. The zeros of the outputs and the
     linear states before the record follow from ``most_likely``; ``variance`` is that of
-    the remaining errors.
+    the remaining errors, times the number of samples that count as one.
     """
 
     levels: Float[Array, " turns *m"]

@@ -1,10 +1,21 @@
-"""Autoregressive model of errors, whose inverse makes them white."""
+"""Coloured errors: how many are independent, and the filter that makes them white."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
 from .refined import NOISE_ORDER
+
+
+def independent(errors: np.ndarray) -> float:
+    """Return the number of independent ``errors``, [samples] or [samples, p].
+
+    It is twice the participation ratio of their spectrum, at least 1. White noise has
+    half as many as samples, because its lines differ by chance.
+    """
+    powers = np.abs(np.fft.rfft(errors, axis=0)) ** 2
+    largest = np.maximum(np.sum(powers**2), np.finfo(float).tiny)
+    return max(2.0 * float(np.sum(powers) ** 2 / largest), 1.0)
 
 
 def whitening_filter(errors: Sequence[np.ndarray]) -> np.ndarray:

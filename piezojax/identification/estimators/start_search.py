@@ -17,6 +17,7 @@ from ...core.system import System
 from ...solve.multi_start import in_batches
 from .approach import TURNS, run_after, runs_after
 from .linear_start import FEW, Start, most_likely, start_columns
+from .noise_model import independent
 
 LEVELS = 9
 """Number of values tried for each level, in all combinations."""
@@ -41,6 +42,10 @@ ROUNDS = 20
 WIDTH = REFINED * 3**TURNS
 """Candidates that are simulated together."""
 
+ESTIMATES = 2
+"""Number of estimates of the number of independent errors: linear states that take up
+slow errors leave those that are more independent."""
+
 REFINEMENTS = 3
 """Number of estimates of the linear states, each with the residual variance of the
 estimate before."""
@@ -52,14 +57,15 @@ def levels_before(
     outputs: np.ndarray,
     part: slice,
     ranges: np.ndarray,
+    samples: float = 1.0,
 ) -> np.ndarray:
     """Return the levels [TURNS, m] of the inputs whose free run fits best.
 
     ``inputs`` [samples, m] or [samples], ``outputs`` [samples, p] or [samples]. Errors
     count over ``part``, after the contribution of the zeros of the sensor and of the
-    states of the linear parts is removed (``most_likely``). ``ranges`` [2, m] or [2]
-    are the ends of the range of the inputs; the levels may lie outside it by up to
-    BEYOND times its width.
+    states of the linear parts is removed (``most_likely``); so many ``samples`` count
+    as one. ``ranges`` [2, m] or [2] are the ends of the range of the inputs; the levels
+    may lie outside it by up to BEYOND times its width.
 
     The search is made twice: with and without treating a hysteresis of few states as
     linear. The former has fewer local optima; the error of the latter decides. If
@@ -69,7 +75,7 @@ def levels_before(
     width = ranges[1] - ranges[0]
     low, high = ranges[0] - BEYOND * width, ranges[1] + BEYOND * width
     u, y = inputs[: part.stop], outputs[part].reshape(part.stop - part.start, -1)
-    search = _LevelSearch(system, jnp.asarray(u), y, part, low, high)
+    search = _LevelSearch(system, jnp.asarray(u), y, part, low, high, samples)
     columns, every = (search.columns(jnp.asarray(ranges), few) for few in (0, FEW))
     found, variance = search.levels(columns)
     if every.shape == columns.shape:
@@ -85,7 +91,7 @@ class _LevelSearch(NamedTuple):
     The free runs of ``system`` under ``inputs`` are compared with the ``outputs``
     [samples, p] of ``part``. The methods take ``columns`` [samples p, k], the effects
     of the zeros and of the states before the record; their coefficients are those of
-    ``most_likely``.
+    ``most_likely``, where so many ``samples`` count as one.
     """
 
     system: System
@@ -94,6 +100,7 @@ class _LevelSearch(NamedTuple):
     part: slice
     low: np.ndarray
     high: np.ndarray
+    samples: float
 
     def columns(self, ends: Array, few: int) -> np.ndarray:
         """Return the columns for a stage at rest, ``few`` as in ``start_columns``."""
@@ -182,7 +189,8 @@ class _LevelSearch(NamedTuple):
     ) -> np.ndarray:
         """Return the mean square error that ``columns`` leave of each run."""
         error = np.clip(np.nan_to_num(self.outputs - runs, nan=1e15), -1e15, 1e15)
-        prior = np.sqrt(variance) * np.eye(columns.shape[1])[self.outputs.shape[1] :]
+        scale = np.sqrt(self.samples * variance)
+        prior = scale * np.eye(columns.shape[1])[self.outputs.shape[1] :]
         base, _ = np.linalg.qr(np.concatenate([columns, prior]))
         # The prior's own rows have no error.
         error, size = error.reshape(len(runs), -1), self.outputs.size
@@ -233,8 +241,29 @@ def start_of(
     The start is estimated on the samples ``part``. The arguments are those of
     ``levels_before``.
     """
-    levels = levels_before(system, inputs, outputs, part, ranges)
-    return start_after(system, inputs, outputs, part, ranges, levels)
+    of = system, inputs, outputs, part, ranges
+    return start_after(*of, levels_before(*of))
+
+
+def cautious_start_of(
+    system: System,
+    inputs: np.ndarray,
+    outputs: np.ndarray,
+    part: slice,
+    ranges: np.ndarray,
+) -> tuple[Start, np.ndarray, np.ndarray]:
+    """Return what ``start_of`` does, from fewer independent errors than samples.
+
+    The errors of a model are slow. If each sample counted, the linear states would take
+    up those of ``part``, and the zero would be wrong for the rest of the record.
+    """
+    of = system, inputs, outputs, part, ranges
+    found = start_of(*of)
+    for _ in range(ESTIMATES):
+        errors = (outputs.reshape(found[1].shape) - found[1])[part]
+        samples = errors.size / independent(errors)
+        found = start_after(*of, levels_before(*of, samples), samples)
+    return found
 
 
 def start_after(
@@ -244,6 +273,7 @@ def start_after(
     part: slice,
     ranges: np.ndarray,
     levels: np.ndarray,
+    samples: float = 1.0,
 ) -> tuple[Start, np.ndarray, np.ndarray]:
     """Return what ``start_of`` does, for known ``levels`` [TURNS, m]."""
     y = outputs.reshape(len(outputs), -1)
@@ -251,10 +281,11 @@ def start_after(
     counted[part] = 1.0
     u, z, of = (jnp.asarray(each) for each in (inputs, y, counted))
 
-    def started(variance: Array) -> Start:
+    def started(variance: Any) -> Start:
+        variance = jnp.asarray(samples * variance)
         return Start(jnp.asarray(levels), jnp.asarray(ranges), variance)
 
-    start = started(jnp.asarray(np.mean(np.var(y[part], axis=0))))
+    start = started(np.mean(np.var(y[part], axis=0)))
     for _ in range(REFINEMENTS):
         *_, variance = _fitted_run(system, u, z, of, start)
         start = started(variance)
