@@ -108,6 +108,18 @@ def test_one_record_has_a_past_too(records):
     assert lag == pytest.approx(LAG, rel=0.02)
 
 
+def test_a_poor_first_guess_of_the_dynamics_does_not_spoil_the_weights(records):
+    # With whitened errors the first guess of the dynamics is tried again in the end.
+    shape = structure(MODEL, records[0], beside=records[1:2])
+    assert shape.dynamics == ("lag.time_constant",)
+    starts = shape.starts.copy()
+    starts[:, shape.space.paths.index("lag.time_constant")] = 0.05
+    shape = shape._replace(starts=starts, whitening=(1.0, -0.9))
+    found = output_error(shape, records[:2], slice(0, SAMPLES), steps=24, passes=3)
+    (lag,), _ = values_and_errors(found)
+    assert lag == pytest.approx(LAG, rel=0.01)
+
+
 @pytest.fixture(scope="module")
 def problem(records):
     shape = structure(MODEL, records[0], beside=records[1:2])

@@ -479,6 +479,13 @@ MUTATIONS = (
         ("tests/identification/test_validation.py",),
     ),
     Mutation(
+        "weights that are fitted at a poor guess of the dynamics",
+        "identification/estimators/output_error.py",
+        "units = np.concatenate([units[:1], again])",
+        "units = np.concatenate([again, units[:1]])",
+        ("tests/identification/test_linear_weights.py",),
+    ),
+    Mutation(
         "weights whose prior follows errors that it has made itself",
         "identification/estimators/linear_weights.py",
         "min(fit.scale, rms / np.sqrt(independent))",

@@ -218,7 +218,8 @@ def output_error(
             dynamics = [problem.space.paths.index(path) for path in structure.dynamics]
             again = units.copy()
             again[:, dynamics] = starts[0, dynamics]
-            units = np.concatenate([again, units])[: len(units) + 1]
+            # The best point first: linear weights are fitted there.
+            units = np.concatenate([units[:1], again])
         problem, units, losses, finished, weights = _descended(
             problem, structure.linear, weights, _inside(units), width, steps, progress
         )
