@@ -15,7 +15,7 @@ from ..core.error_bound import ErrorBound
 from ..core.system import System, accepts, rest_output
 from .estimators.free_runs import first_covering
 from .estimators.projection import excited_columns
-from .estimators.start_search import cautious_start_of
+from .estimators.start_search import start_of
 from .fit import POOR, unexplained_share
 from .records.record import LARGEST, Record
 from .residuals.bound import joined
@@ -47,6 +47,10 @@ WORSE = 2.0
 
 BEYOND = 0.1
 """Share of the recorded range by which an input must leave it to raise a note."""
+
+ESTIMATES = 2
+"""Number of further estimates of the state, each with the number of independent errors:
+linear states that take up slow errors leave those that are more independent."""
 
 
 class PartError(BaseModel):
@@ -201,8 +205,8 @@ def _judged(
     part = _part(record, estimate)
     rest = slice(part.stop, record.samples)
     inputs = _signals(system, record)
-    start, run, zero = cautious_start_of(
-        system, inputs, record.outputs, part, _ranges(inputs, about)
+    start, run, zero = start_of(
+        system, inputs, record.outputs, part, _ranges(inputs, about), ESTIMATES
     )
     run = np.where(np.abs(run) < LARGEST, run, np.nan)
     diverged = not np.all(np.isfinite(run))

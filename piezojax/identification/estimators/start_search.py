@@ -42,10 +42,6 @@ ROUNDS = 20
 WIDTH = REFINED * 3**TURNS
 """Candidates that are simulated together."""
 
-ESTIMATES = 2
-"""Number of estimates of the number of independent errors: linear states that take up
-slow errors leave those that are more independent."""
-
 REFINEMENTS = 3
 """Number of estimates of the linear states, each with the residual variance of the
 estimate before."""
@@ -235,31 +231,20 @@ def start_of(
     outputs: np.ndarray,
     part: slice,
     ranges: np.ndarray,
+    estimates: int = 0,
 ) -> tuple[Start, np.ndarray, np.ndarray]:
     """Return the start of a record, the run from it [samples, p], and the zeros [p].
 
     The start is estimated on the samples ``part``. The arguments are those of
     ``levels_before``.
+
+    The errors of a model are slow. If each sample counts, the linear states take up
+    those of ``part``, and the zero is wrong for the rest of the record. So further
+    ``estimates`` count as many errors as were independent after the one before.
     """
     of = system, inputs, outputs, part, ranges
-    return start_after(*of, levels_before(*of))
-
-
-def cautious_start_of(
-    system: System,
-    inputs: np.ndarray,
-    outputs: np.ndarray,
-    part: slice,
-    ranges: np.ndarray,
-) -> tuple[Start, np.ndarray, np.ndarray]:
-    """Return what ``start_of`` does, from fewer independent errors than samples.
-
-    The errors of a model are slow. If each sample counted, the linear states would take
-    up those of ``part``, and the zero would be wrong for the rest of the record.
-    """
-    of = system, inputs, outputs, part, ranges
-    found = start_of(*of)
-    for _ in range(ESTIMATES):
+    found = start_after(*of, levels_before(*of))
+    for _ in range(estimates):
         errors = (outputs.reshape(found[1].shape) - found[1])[part]
         samples = errors.size / independent(errors)
         found = start_after(*of, levels_before(*of, samples), samples)
