@@ -29,6 +29,10 @@ COVERED = 0.9
 then no model distinguishes the zero from the memory of earlier motions, which only
 larger extrema wipe out."""
 
+AFTER = 0.1
+"""Share of the record that follows in the part: the samples that show the zero without
+that memory."""
+
 LATEST = 0.5
 """Largest share of a record that is used for the estimate."""
 
@@ -130,10 +134,10 @@ def validate(
 
     The state before each record, and the zero of its sensor, are estimated on the
     samples ``estimate``; errors count over the samples after it. By default it is the
-    first fifth of the record, at most 20 000 samples. It is extended until the input
-    has covered 90 % of its range in the record, to at most half of the record and
-    100 000 samples. The state is that after a slow motion from rest over the three
-    levels of the input with the least error. No parameter of the model changes.
+    first fifth of the record, at most 20 000 samples. It is extended until a tenth of
+    the record after the input has covered 90 % of its range, to at most half of the
+    record and 100 000 samples. The state is that after a slow motion from rest over the
+    three levels of the input with the least error. No parameter of the model changes.
 
     Raises ValueError if there is no record, for units that cannot be converted to those
     of the model, another sampling rate, an ``estimate`` that leaves no samples for the
@@ -270,8 +274,8 @@ def default_part(record: Record) -> slice:
         min(most, max(1, round(share * record.samples)))
         for most, share in zip(MOST, (SHARE, LATEST), strict=True)
     )
-    covered = first_covering(record.inputs, COVERED)
-    return slice(0, max(first, min(last, covered + 1)))
+    settled = first_covering(record.inputs, COVERED) + round(AFTER * record.samples)
+    return slice(0, max(first, min(last, settled)))
 
 
 def _signals(system: System, record: Record) -> np.ndarray:

@@ -479,6 +479,13 @@ MUTATIONS = (
         ("tests/identification/test_validation.py",),
     ),
     Mutation(
+        "states before a record from the samples that depend on them alone",
+        "identification/validation.py",
+        "+ round(AFTER * record.samples)",
+        "+ 1",
+        ("tests/identification/test_validation.py",),
+    ),
+    Mutation(
         "weights that are fitted at a poor guess of the dynamics",
         "identification/estimators/output_error.py",
         "units = np.concatenate([units[:1], again])",
