@@ -2,7 +2,6 @@
 
 import contextlib
 from collections.abc import Callable, Sequence
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -12,11 +11,11 @@ from ..core.progress import Progress, Silent
 from ..hysteresis.model import hystereses
 from .chain import dynamics_of, dynamics_parts, structure
 from .estimators.free_runs import from_rest
-from .estimators.output_error import leading, output_error
-from .estimators.resonances import LinearDynamics
+from .estimators.output_error import Optimum, leading, output_error
+from .estimators.structure import Structure
 from .held_dynamics import HeldDynamics
 from .records.record import Record
-from .second_sight import seen_again
+from .second_sight import Begun, seen_again, seen_behind
 
 HYSTERESES = (
     "shaped_coleman_hodgdon",
@@ -36,6 +35,9 @@ FROM_SEVERAL = (*HYSTERESES[:2], "dahl_frictions")
 DENSITY = "preisach"
 """Model of several records if its error is clearly smaller than that of the best other
 one: a density describes many loops, and its fit takes minutes."""
+
+EVERY = (*FROM_SEVERAL, DENSITY)
+"""All models that are fitted to several records."""
 
 CREEP = "exponential_creep"
 """Creep of the default model."""
@@ -57,19 +59,23 @@ hysteresis depends on every motion, the fast ones included."""
 RESOLVED = 8.0
 """Least number of samples in a period of the fastest resonance in a trial."""
 
-STEPS, PASSES = 24, 3
-"""Number of steps of each fit of a trial, and of its fits to several records."""
+STEPS, PASSES, LATER_PASSES = 24, 3, 8
+"""Number of steps of each fit of a trial; number of its fits to several records at
+first, and most further ones of those that are ``CLOSE``."""
+
+CLOSE = 2.0
+"""Ratio to the least error below which the first fits do not decide: those of frictions
+converge slowly."""
 
 
 class Chosen(NamedTuple):
-    """A chain or a hysteresis by name, and the dynamics ``shown`` behind it.
+    """A chain or a hysteresis by name, and its fit to several records, if there is one.
 
-    ``shown`` are those that several records show behind a rough fit of plays, else
-    None.
+    The fit includes the dynamics that show behind its hysteresis.
     """
 
     model: str
-    shown: LinearDynamics | None
+    begun: Begun | None
 
 
 def automatic(
@@ -83,13 +89,14 @@ def automatic(
     The hysteresis is the first of ``HYSTERESES``, or ``FROM_SEVERAL``, unless another
     one has a clearly smaller error (``CLEARLY``) after a short fit to ``record`` and
     those ``beside`` it together; ``DENSITY`` must be clearly better than all of them.
-    The fits use the first samples of a long record (``leading``), those to a single one
-    also a lower sampling rate if it resolves the resonances and the input.
+    Those within a factor of ``CLOSE`` of the best are fitted longer before they are
+    compared. The fits use the first samples of a long record (``leading``), those to a
+    single one also a lower sampling rate if it resolves the resonances and the input.
     With ``dynamics``, which are held, the chain has no other dynamics.
     """
     records = [record, *beside]
-    name, shown = hysteresis_for(records, progress, dynamics)
-    return Chosen(_chain_of(name, records, dynamics), shown)
+    name, begun = hysteresis_for(records, progress, dynamics)
+    return Chosen(_chain_of(name, records, dynamics), begun)
 
 
 def _chain_of(
@@ -140,34 +147,57 @@ def _for_several(
     progress: Progress,
     dynamics: HeldDynamics | None,
 ) -> Chosen:
-    records, shown = [first, *beside], None
+    records = [first, *beside]
     whole = slice(0, max(record.samples for record in records))
+    chains = {name: _chain_of(name, records, dynamics) for name in EVERY}
+    shown = rough = None
     if dynamics is None:
-        plays = _chain_of(PLAYS, records, None)
         # Plays that do not fit leave the dynamics at first sight.
         with contextlib.suppress(ValueError):
-            shown = seen_again(plays, records, whole, progress, looks=LOOKS).shown
+            plays = seen_again(chains[PLAYS], records, whole, progress, looks=LOOKS)
+            shown, rough = plays.shown, plays.fit
 
-    @cache
+    def fit(shape: Structure, begun: Optimum | None, passes: int) -> Optimum | None:
+        if shown is not None:
+            shape = shape._replace(whitening=())  # the dynamics are known already
+        try:
+            return output_error(
+                shape,
+                records,
+                whole,
+                steps=STEPS,
+                progress=progress,
+                passes=passes,
+                begun=begun,
+            )
+        except ValueError:
+            return None
+
+    fits = {}
+    for name, chain in chains.items():
+        shape = structure(chain, first, dynamics, beside=beside, shown=shown)
+        fits[name] = fit(shape, rough, PASSES)
+
     def error(name: str) -> float:
-        """Return the rms error after a short fit to all records, infinite if it fails.
+        """Return the rms error of a fit, infinite if it failed.
 
         It includes the deviations from the prior, so that a model does not win by
         parameters that the records do not determine.
         """
-        chain = _chain_of(name, records, dynamics)
-        shape = structure(chain, first, dynamics, beside=beside, shown=shown)
-        if shown is not None:
-            shape = shape._replace(whitening=())  # the dynamics are known already
-        try:
-            optimum = output_error(
-                shape, records, whole, steps=STEPS, progress=progress, passes=PASSES
-            )
-        except ValueError:
-            return np.inf
-        return float(np.sqrt(optimum.losses[0]))
+        found = fits[name]
+        return np.inf if found is None else float(np.sqrt(found.losses[0]))
 
-    return Chosen(_best((_best(FROM_SEVERAL, error), DENSITY), error), shown)
+    begun, limit = {}, CLOSE * min(map(error, EVERY))
+    if shown is not None:
+        close = [(name, found) for name, found in fits.items() if error(name) < limit]
+        begun = {name: Begun(found, shown) for name, found in close if found}
+    for name, last in [*begun.items()] if len(begun) > 1 else ():
+        seen = seen_behind(last, chains[name], records)
+        found = fit(seen.structure, seen.fit, LATER_PASSES)
+        if found is not None:
+            fits[name], begun[name] = found, Begun(found, seen.shown)
+    best = _best((_best(FROM_SEVERAL, error), DENSITY), error)
+    return Chosen(best, begun.get(best))
 
 
 def _slowing(record: Record) -> int:

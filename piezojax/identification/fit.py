@@ -256,7 +256,7 @@ def identify(
     if model == DEFAULT:
         first, *beside = by_evidence(records, train)
         model, found = automatic(first, progress, beside, options.dynamics)
-        options = replace(options, shown=found)
+        options = replace(options, begun=found)
     chosen, held = method_for(model, method), options.dynamics
     if held is not None and chosen.models:
         raise ValueError(

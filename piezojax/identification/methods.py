@@ -29,7 +29,7 @@ from .estimators.steady_state import fit_structure, steady_response
 from .estimators.structure import Structure
 from .records.record import Record
 from .records.resample import average_periods, resample, whole_periods
-from .second_sight import seen_again
+from .second_sight import fit_seen
 
 EQUAL_LOSS = 1e-3
 """Relative excess of the mean square below which a fit equals the best one."""
@@ -57,6 +57,11 @@ def _by_output_error(
     shown: LinearDynamics | None = None
     if options.known is None and is_closed(records, options):
         found = loop_fit(model, records, train, options, progress)
+    elif len(records) > 1 and options.known is None and options.dynamics is None:
+        optimum, (shape, shown, _) = fit_seen(
+            model, records, train, options.steps, progress, options.begun
+        )
+        found = LoopFit(optimum, optimum.system, shape, "", [])
     else:
         text = ""
         if options.known is not None:
@@ -64,12 +69,7 @@ def _by_output_error(
             text = is_closed(records, options) * FITTED_AGAIN
         else:
             first, *beside = by_evidence(records, train)
-            if beside and options.dynamics is None:
-                shape, shown = seen_again(
-                    model, records, train, progress, options.shown
-                )
-            else:
-                shape = structure(model, first, options.dynamics, beside=beside)
+            shape = structure(model, first, options.dynamics, beside=beside)
         optimum = output_error(
             shape,
             records,

@@ -13,11 +13,10 @@ import numpy as np
 
 from ..core.paths import get, replace
 from ..core.progress import Progress
-from ..core.system import Series, System, series
+from ..core.system import Series, series
 from .chain import LINEAR, by_evidence, dynamics_of, structure
 from .estimators.approach import run_after
-from .estimators.free_runs import starts_of
-from .estimators.output_error import ROUGH_STEPS, output_error
+from .estimators.output_error import ROUGH_STEPS, Optimum, output_error
 from .estimators.resonances import LinearDynamics, dynamics_behind
 from .estimators.structure import Structure
 from .records.record import Record
@@ -30,10 +29,63 @@ NEAR_LAG, NEAR_DAMPING = 0.05, 0.2
 
 
 class Seen(NamedTuple):
-    """A chain to fit, and the dynamics from which its bounds and starts follow."""
+    """A chain to fit, and the dynamics from which its bounds and starts follow.
+
+    ``fit`` is the one behind which they showed; it has found the states before the
+    records.
+    """
 
     structure: Structure
     shown: LinearDynamics
+    fit: Optimum | None = None
+
+
+class Begun(NamedTuple):
+    """A fit of a chain to several records whose dynamics are ``shown``."""
+
+    fit: Optimum
+    shown: LinearDynamics
+
+
+def fit_seen(
+    model: str,
+    records: Sequence[Record],
+    train: slice,
+    steps: int,
+    progress: Progress,
+    begun: Begun | None = None,
+) -> tuple[Optimum, Seen]:
+    """Fit the chain ``model`` with the dynamics that show behind its hysteresis.
+
+    The arguments are those of ``seen_again`` and ``output_error``. The fit goes on from
+    one that was ``begun`` with the first samples of the same records. A weak mode may
+    show only behind the hysteresis of the last fit: the chain is then fitted with it,
+    too.
+    """
+    ordered = by_evidence(records, train)
+
+    def fit(seen: Seen) -> Optimum:
+        return output_error(
+            seen.structure,
+            ordered,
+            train,
+            steps=steps,
+            progress=progress,
+            begun=seen.fit,
+        )
+
+    if begun is None:
+        seen = seen_again(model, ordered, train, progress)
+    else:
+        seen = seen_behind(begun, model, ordered)
+    optimum = fit(seen)
+    if seen.structure.whitening:
+        more = seen_behind(Begun(optimum, seen.shown), model, ordered)
+        if len(more.shown.modes) > len(seen.shown.modes):
+            wider = fit(more)
+            if wider.losses[0] < optimum.losses[0]:
+                return wider, more
+    return optimum, seen
 
 
 def seen_again(
@@ -41,41 +93,59 @@ def seen_again(
     records: Sequence[Record],
     train: slice,
     progress: Progress,
-    shown: LinearDynamics | None = None,
     looks: int = LOOKS,
 ) -> Seen:
     """Return the chain ``model`` with the dynamics that show behind its hysteresis.
 
-    A rough fit to the samples ``train`` of the ``records`` gives the hysteresis, and
-    the only start of the structure. The first one has the dynamics ``shown``, by
-    default those at first sight. If there is no resonance at first sight, the structure
-    is that of ``chain.structure``.
+    A rough fit to the samples ``train`` of the ``records``, which are sorted
+    ``by_evidence``, gives the hysteresis, and the only start of the structure. The
+    first one has the dynamics at first sight. If there is no resonance at first sight,
+    the structure is that of ``chain.structure``.
     """
-    first, *beside = by_evidence(records, train)
-    shown = shown or dynamics_of(first)
-    shape = structure(model, first, beside=beside, shown=shown)
-    for _ in range(looks if shape.whitening else 0):
+    first, *beside = records
+    shown = dynamics_of(first)
+    seen = Seen(structure(model, first, beside=beside, shown=shown), shown)
+    for _ in range(looks if seen.structure.whitening else 0):
         rough = output_error(
-            shape, records, train, steps=ROUGH_STEPS, progress=progress, passes=1
+            seen.structure,
+            records,
+            train,
+            steps=ROUGH_STEPS,
+            progress=progress,
+            passes=1,
+            begun=seen.fit,
         )
-        last, found = shown, _best(rough.system, [first, *beside], train)
-        if not found.modes:
+        last, seen = seen, seen_behind(Begun(rough, seen.shown), model, records)
+        if seen.structure.linear is not None:
+            seen = seen._replace(fit=None)  # a single pass has not searched for them
+        if _equal(seen.shown, last.shown):
             break
-        shown = found._replace(
-            slope=last.slope, slew=last.slew, input_unit=last.input_unit
-        )
-        again = structure(model, first, beside=beside, shown=shown)
-        kept = set(rough.problem.space.paths) & set(again.space.paths)
-        values = {path: get(rough.system, path) for path in kept - set(again.dynamics)}
-        start = again.space.nearest(replace(again.system, values))
-        system = again.system
-        if again.linear:
-            fitted = get(rough.system, again.linear.path)
-            system = replace(system, {again.linear.path: fitted})
-        shape = again._replace(system=system, starts=start[None], guess=again.starts[0])
-        if _equal(shown, last):
-            break
-    return Seen(shape, shown)
+    return seen
+
+
+def seen_behind(begun: Begun, model: str, records: Sequence[Record]) -> Seen:
+    """Return what shows behind the hysteresis of a fit to ``records``.
+
+    The chain starts at this fit. Its dynamics stay if no resonance shows.
+    """
+    fit, last = begun
+    first, *beside = records
+    shown = _best(fit, records)
+    if shown.modes:
+        kept = {"slope": last.slope, "slew": last.slew, "input_unit": last.input_unit}
+        shown = shown._replace(**kept)
+    else:
+        shown = last
+    again = structure(model, first, beside=beside, shown=shown)
+    both = set(fit.problem.space.paths) & set(again.space.paths)
+    values = {path: get(fit.system, path) for path in both - set(again.dynamics)}
+    start = again.space.nearest(replace(again.system, values))
+    system = again.system
+    if again.linear:
+        weights = get(fit.system, again.linear.path)
+        system = replace(system, {again.linear.path: weights})
+    shape = again._replace(system=system, starts=start[None], guess=again.starts[0])
+    return Seen(shape, shown, fit)
 
 
 def _equal(one: LinearDynamics, other: LinearDynamics) -> bool:
@@ -87,16 +157,17 @@ def _equal(one: LinearDynamics, other: LinearDynamics) -> bool:
     return lags and np.allclose(*damping, rtol=NEAR_DAMPING)
 
 
-def _best(system: System, records: Sequence[Record], train: slice) -> LinearDynamics:
+def _best(fit: Optimum, records: Sequence[Record]) -> LinearDynamics:
     """Return the dynamics with the most modes; if equal, those of the first record."""
+    system, starts = fit.system, fit.problem.starts
     assert isinstance(system, Series)
+    assert starts is not None
     parts = dict(zip(system.names, system.parts, strict=True))
     place = next(i for i, name in enumerate(system.names) if name in LINEAR)
     front = series(**{name: parts[name] for name in system.names[:place]})
-    starts, _, _ = starts_of(system, records, train)
     found = []
-    for record, start in zip(records, starts, strict=True):
-        run = np.asarray(run_after(front, jnp.asarray(record.input), start.levels))
+    for record, levels in zip(records, starts.levels, strict=True):
+        run = np.asarray(run_after(front, jnp.asarray(record.input), levels))
         # A plant maps u(k) to y(k+1): the sample of delay belongs to the dynamics.
         ahead = np.append(run[1:], run[-1])
         found.append(dynamics_behind(ahead, record.output, record.dt))

@@ -1,20 +1,23 @@
 """Trials that choose the hysteresis of a default model: their records and rates."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 import piezojax.identification.automatic as automatic
 from piezojax.identification.automatic import (
     DENSITY,
+    EVERY,
     FROM_SEVERAL,
     SAMPLES,
     VARIATION,
     _slowed,
     _slowing,
 )
+from piezojax.identification.estimators.output_error import Optimum
+from piezojax.identification.estimators.resonances import LinearDynamics
+from piezojax.identification.estimators.structure import Structure
 from piezojax.identification.records.record import Record
+from piezojax.identification.second_sight import Seen
 
 DT = 5e-5
 TIME = DT * np.arange(40_000)
@@ -72,20 +75,57 @@ def test_a_hysteresis_of_more_parameters_must_be_clearly_better(
     errors, best, monkeypatch
 ):
     """The ``errors`` of the short fits are given; None if one fails."""
-    known = dict(zip((*FROM_SEVERAL, DENSITY), errors, strict=True))
-
-    def output_error(name, *_, **__):
-        if known[name] is None:
-            raise ValueError("no start led to a finite simulation")
-        return SimpleNamespace(losses=[known[name] ** 2])
+    known = dict(zip(EVERY, errors, strict=True))
 
     def seen_again(*_, **__):
         raise ValueError("plays do not fit")
 
     monkeypatch.setattr(automatic, "seen_again", seen_again)
-    monkeypatch.setattr(automatic, "output_error", output_error)
+    monkeypatch.setattr(automatic, "output_error", fitting(lambda name: known[name]))
+    monkeypatch.setattr(automatic, "structure", named)
+    assert automatic.hysteresis_for(several()).model == best
+
+
+def test_longer_fits_decide_between_models_whose_first_fits_are_close(monkeypatch):
+    """Frictions converge slowly; plays are too far off to be fitted again."""
+    errors = {name: [20.0] for name in EVERY}
+    errors[CURVE], errors[FRICTIONS] = [10.0, 9.0], [12.0, 1.0]
+    shown = LinearDynamics()
+
+    def seen(*_, **__):
+        return Seen(named(PLAYS), shown)
+
+    def seen_behind(begun, chain, _):
+        return Seen(named(chain), begun.shown)
+
+    monkeypatch.setattr(automatic, "seen_again", seen)
+    monkeypatch.setattr(automatic, "seen_behind", seen_behind)
     monkeypatch.setattr(
-        automatic, "structure", lambda chain, *_, **__: chain.partition("+")[0]
+        automatic, "output_error", fitting(lambda name: errors[name].pop(0))
     )
-    records = [record_of(CYCLES), record_of(0.9 * CYCLES)]
-    assert automatic.hysteresis_for(records).model == best
+    monkeypatch.setattr(automatic, "structure", named)
+    chosen = automatic.hysteresis_for(several())
+    assert chosen.model == FRICTIONS
+    assert chosen.begun.fit.losses == [1.0]
+    assert errors == {name: [] for name in EVERY}
+
+
+def named(chain, *_, **__):
+    """Return an empty structure that holds the name of its hysteresis."""
+    return Structure(chain.partition("+")[0], None, np.zeros((1, 0)))
+
+
+def fitting(error):
+    """Return a fit whose ``error`` follows from the name of its structure."""
+
+    def output_error(shape, *_, **__):
+        found = error(shape.system)
+        if found is None:
+            raise ValueError("no start led to a finite simulation")
+        return Optimum(None, None, np.array([found**2]), finished=True)
+
+    return output_error
+
+
+def several():
+    return [record_of(CYCLES), record_of(0.9 * CYCLES)]

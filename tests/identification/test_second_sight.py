@@ -1,5 +1,7 @@
 """Dynamics behind a fitted hysteresis, of stages that share no code with ours."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from oracles import forty_stages
@@ -106,3 +108,19 @@ def test_several_records_begin_with_a_stage_without_power(records):
 def test_starts_that_differ_only_in_the_state_before_a_record_are_one(records):
     shape = structure("dahl_frictions+lag", records[0])
     assert len(shape.starts) > len(shape.without(shape.own).starts) == 1
+
+
+def test_a_weak_mode_shows_at_a_high_rate_behind_a_slow_sensor():
+    # Least squares in the coefficients of this order do not determine them.
+    modes = np.array([[503.0, 0.0093, 1.05], [846.0, 0.027, -0.05]])
+    changed = {"rate": 20e3, "modes": modes, "sensor_lag": 9.3e-4, "slew": 1e9}
+    one = Stage(dataclasses.replace(stage().parameters, **changed))
+    random = np.random.default_rng(1)
+    heights = random.uniform(-10.0, 110.0, 20)
+    u = np.repeat(heights, random.integers(400, 2400, 20))
+    y = np.append(one.reset(float(u[0]), 1), one.respond(u)[0][:-1])
+    path = np.concatenate([np.linspace(0.0, u[0], 200), u])
+    front = one._remembered(path)[200:]
+    found = dynamics_behind(front * np.ptp(y) / np.ptp(front), y, 1.0 / 20e3)
+    assert [mode.frequency for mode in found.modes] == pytest.approx(modes[:, 0], 5e-3)
+    assert [mode.share for mode in found.modes] == pytest.approx(modes[:, 2], abs=0.01)

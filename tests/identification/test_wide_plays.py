@@ -60,6 +60,7 @@ def test_a_play_that_moves_once_in_each_record_is_found(records):
         if r > 40.0
     )
     assert wide == pytest.approx(0.08, rel=0.3)
-    found = pj.validate(fit.system, fit.about, third)
+    # The first cycles do not tell the state of the wide plays from the zero.
+    found = pj.validate(fit.system, fit.about, third, estimate=slice(0, 450))
     (check,) = found.report.records
     assert check.percent_of_span < 0.3

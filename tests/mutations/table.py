@@ -467,7 +467,7 @@ MUTATIONS = (
     Mutation(
         "fits of several records that end with their first prior",
         "identification/estimators/output_error.py",
-        "settled = turn > int(alone) and losses[0] > PASSED * before",
+        "settled = turn > int(alone) and losses[0] > PASSED * past",
         "settled = turn > 0",
         ("tests/identification/test_vague_parameters.py",),
     ),
@@ -484,6 +484,27 @@ MUTATIONS = (
         "+ round(AFTER * record.samples)",
         "+ 1",
         ("tests/identification/test_validation.py",),
+    ),
+    Mutation(
+        "past samples, nearly equal at a high rate, in place of their differences",
+        "identification/estimators/refined.py",
+        "scipy.linalg.block_diag(_differences(poles), _differences(zeros + 1))",
+        "np.eye(poles + zeros + 1)",
+        ("tests/identification/test_second_sight.py",),
+    ),
+    Mutation(
+        "a weak mode searched from least squares alone",
+        "identification/estimators/hammerstein.py",
+        "if weak and best is not None:",
+        "if False and weak and best is not None:",
+        ("tests/identification/test_second_sight.py",),
+    ),
+    Mutation(
+        "models of several records compared before their fits settle",
+        "identification/automatic.py",
+        "if len(begun) > 1 else ()",
+        "if len(begun) > 9 else ()",
+        ("tests/identification/test_automatic.py",),
     ),
     Mutation(
         "weights that are fitted at a poor guess of the dynamics",

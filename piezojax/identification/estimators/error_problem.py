@@ -189,7 +189,11 @@ def problem_of(
 
 def at_starts(problem: Problem, starts: Sequence[Start]) -> Problem:
     """Return the problem whose records begin at the ``starts``."""
-    stacked = jax.tree.map(lambda *each: jnp.stack(each), *starts)
+    return at_stacked(problem, jax.tree.map(lambda *each: jnp.stack(each), *starts))
+
+
+def at_stacked(problem: Problem, starts: Start) -> Problem:
+    """Return the problem whose records begin at ``starts``, stacked into one."""
     return eqx.tree_at(
-        lambda p: p.starts, problem, stacked, is_leaf=lambda leaf: leaf is None
+        lambda p: p.starts, problem, starts, is_leaf=lambda leaf: leaf is None
     )

@@ -14,6 +14,7 @@ from .resonances import LinearDynamics
 
 if TYPE_CHECKING:
     from ..known_plant import KnownPlant
+    from ..second_sight import Begun
 
 
 class FittedParameter(BaseModel):
@@ -43,8 +44,8 @@ class Options:
     steps of a descent. ``dynamics`` are held fixed in the fit of a chain.
     ``closed_loop`` is one of ``closed_loop.APPROACHES`` to a record of a closed loop,
     by default chosen from the record; ``controller`` is the controller that closed it,
-    for ``indirect``. ``known`` is a plant that is fitted again. ``shown`` are the
-    linear dynamics of the stage, if the choice of the model has found them.
+    for ``indirect``. ``known`` is a plant that is fitted again. ``begun`` is a fit to
+    several records that goes on, if the choice of the model has made one.
     """
 
     order: int = 4
@@ -55,7 +56,7 @@ class Options:
     closed_loop: str | None = None
     controller: System | None = None
     known: "KnownPlant | None" = None
-    shown: LinearDynamics | None = None
+    begun: "Begun | None" = None
 
 
 class LinearDetail(NamedTuple):

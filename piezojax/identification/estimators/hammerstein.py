@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...core.recipe import Resonance
+from .further_mode import with_further_mode
 from .refined import TransferFunction, refined_instrumental_variables
 
 ROUNDS = 3
@@ -207,18 +208,25 @@ def _held(rates: Sequence[complex], dt: float, turn: np.ndarray) -> np.ndarray:
 
 
 def _fitted(
-    signals: Signals, modes: int, lags: int, delay: int = 1
+    signals: Signals,
+    modes: int,
+    lags: int,
+    delay: int = 1,
+    start: Hammerstein | None = None,
 ) -> Hammerstein | None:
-    """Return the model of this order, or None if the record does not determine it."""
+    """Return the model of this order, or None if the record does not determine it.
+
+    The fit begins at ``start``, a model of the same order, if there is one.
+    """
     poles = 2 * modes + lags
     orders = (poles, max(1, poles), delay)
-    model: Hammerstein | None = None
-    weights = np.eye(len(signals.plays))[0]
+    model = start
+    weights = np.eye(len(signals.plays))[0] if start is None else start.weights
     for _ in range(ROUNDS):
-        start = None if model is None else model.dynamics
+        known = None if model is None else model.dynamics
         x = weights @ signals.plays
         try:
-            found = refined_instrumental_variables(x, signals.output, *orders, start)
+            found = refined_instrumental_variables(x, signals.output, *orders, known)
         except (ValueError, np.linalg.LinAlgError):
             return None
         model = Hammerstein(signals, weights, found)
@@ -243,14 +251,32 @@ def with_lag(signals: Signals, modes: int, delay: int = 1) -> Hammerstein | None
     return best
 
 
-def chosen(signals: Signals) -> Hammerstein:
-    """Return the model with as many modes as lower the error."""
+def _with_mode(model: Hammerstein) -> Hammerstein | None:
+    """Return ``model`` with one more mode, fitted from the one that it lacks most."""
+    poles = model.dynamics.poles().size
+    if not poles:
+        return None
+    signals = model.signals
+    moved = model.weights @ signals.plays
+    wider = with_further_mode(model.dynamics, moved, signals.output)
+    start = model._replace(dynamics=wider)
+    return _fitted(signals, poles // 2 + 1, poles % 2, wider.delay, start)
+
+
+def chosen(signals: Signals, weak: bool = False) -> Hammerstein:
+    """Return the model with as many modes as lower the error.
+
+    With ``weak``, the modes that the errors show are tried as well. Errors of the plays
+    look like weak modes.
+    """
     best = with_lag(signals, 0)
     chance = np.exp(-EVIDENCE / signals.output.size)
     for modes, drop in enumerate(DROPS, 1):
         if white_error(best) < NEGLIGIBLE * np.std(signals.output):
             break
         model = with_lag(signals, modes)
+        if weak and best is not None:
+            model = min(model, _with_mode(best), key=white_error)
         shown = model is not None and len(model.modes(1.0)) == modes
         if not shown or white_error(model) > min(drop, chance) * white_error(best):
             break

@@ -25,7 +25,7 @@ from ...solve.local_model import normal_equations
 from ...solve.multi_start import Patience, descend
 from ...solve.problem import linearised
 from ..records.record import Record
-from .error_problem import Problem, at_starts, problem_of
+from .error_problem import Problem, at_stacked, at_starts, problem_of
 from .free_runs import settled_part, settled_starts, starts_of
 from .linear_weights import WeightsFit, with_weights
 from .noise_model import NOISE_ORDER
@@ -121,6 +121,7 @@ def output_error(
     drives: Sequence[np.ndarray] | None = None,
     own_starts: bool = False,
     passes: int = PASSES,
+    begun: "Optimum | None" = None,
 ) -> Optimum:
     """Fit ``structure`` to ``records`` by the mean square of the free-run error.
 
@@ -135,8 +136,9 @@ def output_error(
     ``own`` parameters, and the ``vague`` parameters have a weak prior at the first
     start; its scale follows from the errors of a first fit without it, then of each fit
     with it. ``passes`` is the largest number of searches for the states, each followed
-    by a fit. With ``linear`` weights, the first fit uses the samples that depend little
-    on the states (``settled_part``) instead.
+    by a fit. The first search is left out after another fit to the records, ``begun``,
+    whose states are taken. Otherwise, with ``linear`` weights, the first fit uses the
+    samples that depend little on the states (``settled_part``).
 
     With a ``noise_model`` the error is that of the prediction by the model and an
     autoregressive model of its errors, which are fitted alternately (Ljung, System
@@ -181,23 +183,25 @@ def output_error(
     rough = min(steps, ROUGH_STEPS) if whitened or several else steps
     units, losses, finished = _inside(starts), np.zeros(len(starts)), False
     parts = [settled_part(record.input, train) for record in records]
-    whole, settled, weights = problem.weights, not several, None
+    whole, settled = problem.weights, not several
+    weights = begun and begun.weights
     alone = cautious or structure.linear is not None
     for turn in range(passes):
         if several:
             system = problem.space.put(problem.system, as_array(units[0]))
-            if turn or structure.linear is None:
+            if begun is not None and begun.problem.starts is not None and not turn:
+                problem = at_stacked(problem, begun.problem.starts)
+            elif turn or structure.linear is None:
                 found, *_ = starts_of(system, records, train)
-                problem = problem.weighted(whole)
+                problem = at_starts(problem.weighted(whole), found)
             else:
                 # With the first guess of the weights no state would be right.
                 found = settled_starts(system, records, parts)
-                problem = problem.only(parts)
-            problem = at_starts(problem, found)
+                problem = at_starts(problem.only(parts), found)
         if cautious and turn:
             prior = _lighter(prior, _first_guess(structure, problem, units[0]))
             problem = _with_prior(problem, prior)
-        last, before = settled or turn == passes - 1, losses[0]
+        last, past = settled or turn == passes - 1, losses[0]
         limit = steps if last and not whitened else rough
         problem, units, losses, finished, weights = _descended(
             problem, structure.linear, weights, _inside(units), width, limit, progress
@@ -205,15 +209,22 @@ def output_error(
         if last:
             break
         # The first fit may have no prior or fewer samples: it compares with no other.
-        settled = turn > int(alone) and losses[0] > PASSED * before
-    before = np.inf
-    for _ in range(NOISE_PASSES if noise_model else int(whitened)):
+        settled = turn > int(alone) and losses[0] > PASSED * past
+    past = np.inf
+    for turn in range(NOISE_PASSES if noise_model else int(whitened) * passes):
         point = as_array(units[0])
         if noise_model:
             problem = problem.predicting(point)
-        else:
+        elif not turn:
             problem = _balanced(problem, point)
-        if np.isinf(before) and not known:
+            past = problem.spread(point)[0] ** 2
+        else:
+            system = problem.space.put(problem.system, point)
+            problem = at_starts(problem, starts_of(system, records, train)[0])
+            if cautious:
+                prior = _lighter(prior, _first_guess(structure, problem, units[0]))
+                problem = _with_prior(problem, prior)
+        if not turn and not known:
             # Errors of the hysteresis may have hidden a resonance from the first fit.
             dynamics = [problem.space.paths.index(path) for path in structure.dynamics]
             again = units.copy()
@@ -223,9 +234,17 @@ def output_error(
         problem, units, losses, finished, weights = _descended(
             problem, structure.linear, weights, _inside(units), width, steps, progress
         )
-        if abs(before - losses[0]) <= NOISE_SETTLED * losses[0]:
+        if noise_model:
+            left, settled = (
+                losses[0],
+                abs(past - losses[0]) <= NOISE_SETTLED * losses[0],
+            )
+        else:
+            left = problem.spread(as_array(units[0]))[0] ** 2
+            settled = not several or left > PASSED * past
+        if settled:
             break
-        before = losses[0]
+        past = left
     if cautious:
         problem = _with_prior(problem, none)  # errors are those of the records alone
         weights = weights and weights._replace(problem=problem)

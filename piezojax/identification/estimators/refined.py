@@ -87,6 +87,8 @@ def refined_instrumental_variables(
     else:
         a, b = start.denominator, start.numerator
     found: list[TransferFunction] = []
+    # At a high rate past samples are nearly equal, and only their differences tell.
+    basis = scipy.linalg.block_diag(_differences(poles), _differences(zeros + 1))
     for _ in range(ITERATIONS):
         model = _with_noise(x, y, a, b, delay)
         found.append(model)
@@ -94,10 +96,10 @@ def refined_instrumental_variables(
         measured, modelled, driven = (
             _filtered(*prefilter, signal) for signal in (y, model.applied(x), x)
         )
-        rows = _rows(driven, measured, poles, zeros, delay)
-        instruments = _rows(driven, modelled, poles, zeros, delay)
+        rows = _rows(driven, measured, poles, zeros, delay) @ basis
+        instruments = _rows(driven, modelled, poles, zeros, delay) @ basis
         solution = _solved(instruments.T @ rows, instruments.T @ measured[SETTLE:])
-        last, (a, b) = a, _split(solution, poles)
+        last, (a, b) = a, _split(basis @ solution, poles)
         if np.max(np.abs(a - last)) < CONVERGED:
             break
     return min(found, key=lambda model: model.cost)
@@ -110,6 +112,15 @@ def _rows(
     past = [-_shifted(y, i) for i in range(1, poles + 1)]
     driven = [_shifted(x, delay + i) for i in range(zeros + 1)]
     return np.stack([*past, *driven], axis=1)[SETTLE:]
+
+
+def _differences(count: int) -> np.ndarray:
+    """Return the matrix whose columns turn ``count`` past samples into differences.
+
+    Their orders are 0, 1, ... in turn.
+    """
+    signs = (-1.0) ** np.arange(count)[:, None]
+    return signs * scipy.linalg.pascal(count, kind="upper") if count else np.eye(0)
 
 
 def _shifted(signal: np.ndarray, samples: int) -> np.ndarray:

@@ -151,12 +151,12 @@ def dynamics_behind(front: np.ndarray, output: np.ndarray, dt: float) -> LinearD
     if x.size < SHORTEST:
         return LinearDynamics()
     signals = Signals(_above_slowest(x)[None], np.ones(1), _above_slowest(y))
-    return _shown(signals, dt)[0]
+    return _shown(signals, dt, weak=True)[0]
 
 
-def _shown(signals: Signals, dt: float) -> _Found:
+def _shown(signals: Signals, dt: float, weak: bool = False) -> _Found:
     try:
-        model = chosen(signals)
+        model = chosen(signals, weak)
     except (ValueError, np.linalg.LinAlgError):
         return LinearDynamics(), None
     modes, lags = model.modes(dt), model.lags(dt)
