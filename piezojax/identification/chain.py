@@ -116,22 +116,23 @@ def dynamics_parts(record: Record, beside: Sequence[Record] = ()) -> str:
 
     A slew rate is among them if the record shows one. Delay and slew rate are if this
     record or those ``beside`` it have steps that are too few to tell them apart. With
-    several records the chain has room for the modes, lag and delay that show only
-    behind a fitted hysteresis (``second_sight``).
+    several records the chain has room for the modes, lag, delay and, with steps, slew
+    rate that show only behind a fitted hysteresis (``second_sight``).
     """
     shown = dynamics_of(record)
     if not shown.modes:
         return "lag"
     several = bool(beside)
     late = shown.delay is not None and shown.delay > FRACTION * record.dt
-    unclear = _unclear_step(record, beside) > 0.0
+    unclear = unclear_step(record, beside) > 0.0
     alone = len(shown.modes) == 1 and not shown.lags and not several
     found = ["mode" if alone else "modes"]
     found += ["delay"] * (late or unclear or several)
-    return "+".join(found + ["slew"] * (shown.slew is not None or unclear))
+    slews = shown.slew is not None or unclear or (several and has_steps(record.input))
+    return "+".join(found + ["slew"] * slews)
 
 
-def _unclear_step(record: Record, beside: Sequence[Record]) -> float:
+def unclear_step(record: Record, beside: Sequence[Record]) -> float:
     """Return the largest step (V) whose ramp may be in the delay of ``record``, or 0.
 
     A record with many steps, which comes first (``by_evidence``), shows the slew rate.
@@ -172,7 +173,7 @@ def extent_of(
         lags=shown.lags,
         delay=shown.delay,
         slew=shown.slew,
-        jump=_unclear_step(record, beside),
+        jump=unclear_step(record, beside),
         reach=reach,
         before=1.0 + 2.0 * BEYOND if beside else 1.0,
     )

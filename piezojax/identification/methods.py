@@ -11,7 +11,7 @@ from ..core.paths import get, parameters, replace
 from ..core.progress import Progress
 from ..core.system import Affine, series
 from ..hysteresis.model import hystereses
-from .chain import OFFSET, by_evidence, structure
+from .chain import OFFSET, by_evidence, structure, unclear_step
 from .closed_loop import LoopFit, is_closed, loop_fit
 from .estimators.approach import BEFORE, without_before
 from .estimators.estimate import Estimate, FittedParameter, Options, bound_warning
@@ -37,6 +37,9 @@ EQUAL_LOSS = 1e-3
 AMBIGUOUS = 0.01
 """Spread of a parameter among equally good fits, as a share of its range, above which
 to warn."""
+
+SLEW = "drive.rate"
+"""Path of the slew rate of the amplifier."""
 
 INPUT_BEFORE, ZERO = "input before the record", "zero of"
 """Names of the input in force before a single record, and of the zero of the sensor in
@@ -93,6 +96,7 @@ def _by_output_error(
         )
     }
     warnings = _optimum_warnings(optimum, named, shape, options.steps)
+    warnings += slew_warning(named, by_evidence(records, train))
     if not found.scatter_known:
         named = {
             name: one.model_copy(update={"standard_error": None})
@@ -156,6 +160,19 @@ def _optimum_warnings(
                 f"{100.0 * spread[i]:.2g} % of its range"
             )
     return found
+
+
+def slew_warning(fitted: Mapping[str, FittedParameter], records: Records) -> list[str]:
+    """Return a warning if the ``records``, sorted ``by_evidence``, only hint at it."""
+    first, *beside = records
+    if SLEW not in fitted or not unclear_step(first, beside):
+        return []
+    rate = f"{fitted[SLEW].value:.3g} {first.input_unit}/s"
+    return [
+        f"the slew rate {SLEW}, {rate}, is a guess: so few steps do not tell it from a "
+        "delay. Expect larger errors after jumps, or add a record with five steps or "
+        "more of the size that the stage will meet"
+    ]
 
 
 def _by_regression(estimator: Callable) -> Callable[..., Estimate]:

@@ -10,14 +10,16 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from ..core.paths import get, replace
 from ..core.progress import Progress
-from ..core.system import Series, series
-from .chain import LINEAR, by_evidence, dynamics_of, structure
+from ..core.system import Series, System, series
+from .chain import DRIVE, LINEAR, by_evidence, dynamics_of, structure
 from .estimators.approach import run_after
 from .estimators.output_error import ROUGH_STEPS, Optimum, output_error
-from .estimators.resonances import LinearDynamics, dynamics_behind
+from .estimators.resonances import LinearDynamics, dynamics_behind, slew_behind
+from .estimators.slew_rate import slewed
 from .estimators.structure import Structure
 from .records.record import Record
 
@@ -25,7 +27,8 @@ LOOKS = 3
 """Most looks, each after a rough fit with the dynamics of the one before."""
 
 NEAR_LAG, NEAR_DAMPING = 0.05, 0.2
-"""Relative changes of lags and damping ratios that need no further look."""
+"""Relative changes of lags, of the slew rate, and of damping ratios that need no
+further look."""
 
 
 class Seen(NamedTuple):
@@ -58,9 +61,9 @@ def fit_seen(
     """Fit the chain ``model`` with the dynamics that show behind its hysteresis.
 
     The arguments are those of ``seen_again`` and ``output_error``. The fit goes on from
-    one that was ``begun`` with the first samples of the same records. A weak mode may
-    show only behind the hysteresis of the last fit: the chain is then fitted with it,
-    too.
+    one that was ``begun`` with the first samples of the same records. A weak mode or
+    the slew rate may show only behind the hysteresis of the last fit: the chain is then
+    fitted with it, too.
     """
     ordered = by_evidence(records, train)
 
@@ -81,7 +84,7 @@ def fit_seen(
     optimum = fit(seen)
     if seen.structure.whitening:
         more = seen_behind(Begun(optimum, seen.shown), model, ordered)
-        if len(more.shown.modes) > len(seen.shown.modes):
+        if not _equal(more.shown, seen.shown):
             wider = fit(more)
             if wider.losses[0] < optimum.losses[0]:
                 return wider, more
@@ -132,8 +135,8 @@ def seen_behind(begun: Begun, model: str, records: Sequence[Record]) -> Seen:
     first, *beside = records
     shown = _best(fit, records)
     if shown.modes:
-        kept = {"slope": last.slope, "slew": last.slew, "input_unit": last.input_unit}
-        shown = shown._replace(**kept)
+        slew = last.slew if shown.slew is None else shown.slew
+        shown = shown._replace(slope=last.slope, slew=slew, input_unit=last.input_unit)
     else:
         shown = last
     again = structure(model, first, beside=beside, shown=shown)
@@ -149,26 +152,48 @@ def seen_behind(begun: Begun, model: str, records: Sequence[Record]) -> Seen:
 
 
 def _equal(one: LinearDynamics, other: LinearDynamics) -> bool:
-    """Return whether modes and lags agree within the narrowest bounds of a fit."""
+    """Return whether both agree within the narrowest bounds of a fit."""
     if (len(one.modes), len(one.lags)) != (len(other.modes), len(other.lags)):
         return False
-    lags = np.allclose(one.lags, other.lags, rtol=NEAR_LAG)
-    damping = [[mode.damping for mode in each.modes] for each in (one, other)]
+    both = one, other
+    times = [
+        [*each.lags, 0.0 if each.slew is None else 1.0 / each.slew] for each in both
+    ]
+    damping = [[mode.damping for mode in each.modes] for each in both]
+    lags = np.allclose(*times, rtol=NEAR_LAG, atol=0.0)
     return lags and np.allclose(*damping, rtol=NEAR_DAMPING)
 
 
 def _best(fit: Optimum, records: Sequence[Record]) -> LinearDynamics:
-    """Return the dynamics with the most modes; if equal, those of the first record."""
+    """Return the dynamics with the most modes; if equal, those of the first record.
+
+    The slew rate is that of the first record with steps that show one.
+    """
     system, starts = fit.system, fit.problem.starts
     assert isinstance(system, Series)
     assert starts is not None
-    parts = dict(zip(system.names, system.parts, strict=True))
     place = next(i for i, name in enumerate(system.names) if name in LINEAR)
-    front = series(**{name: parts[name] for name in system.names[:place]})
+    parts = dict(zip(system.names[:place], system.parts[:place], strict=True))
+    amplifier, hysteresis = parts.pop(DRIVE, None), series(**parts)
     found = []
     for record, levels in zip(records, starts.levels, strict=True):
-        run = np.asarray(run_after(front, jnp.asarray(record.input), levels))
-        # A plant maps u(k) to y(k+1): the sample of delay belongs to the dynamics.
-        ahead = np.append(run[1:], run[-1])
-        found.append(dynamics_behind(ahead, record.output, record.dt))
-    return max(found, key=lambda each: len(each.modes))
+
+        def front_of(
+            input: np.ndarray, front: System = hysteresis, levels: Array = levels
+        ) -> np.ndarray:
+            run = np.asarray(run_after(front, jnp.asarray(input), levels))
+            # A plant maps u(k) to y(k+1): the delay belongs to the dynamics.
+            return np.append(run[1:], run[-1])
+
+        slew = slew_behind(front_of, record.input, record.output, record.dt)
+        if slew is not None:
+            front = front_of(slewed(record.input, slew * record.dt))
+        elif amplifier is not None:
+            front = front_of(record.input, series(drive=amplifier, **parts))
+        else:
+            front = front_of(record.input)
+        shown = dynamics_behind(front, record.output, record.dt)
+        found.append(shown._replace(slew=slew))
+    best = max(found, key=lambda each: len(each.modes))
+    slews = (each.slew for each in found if each.slew is not None)
+    return best._replace(slew=next(slews, None))

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import scipy.signal
+from oracles import hysteresis as oracle
 
 from piezojax import Record, simulate
 from piezojax.control.design_model import design_model
@@ -16,7 +17,10 @@ from piezojax.identification.chain import (
     extent_of,
     structure,
 )
+from piezojax.identification.estimators.estimate import FittedParameter
+from piezojax.identification.estimators.resonances import slew_behind
 from piezojax.identification.estimators.slew_rate import few_steps
+from piezojax.identification.methods import slew_warning
 
 DT, RATE = 1e-4, 1e5
 FINE = 1000
@@ -129,6 +133,39 @@ def test_a_record_beside_it_tells_that_a_slew_rate_may_be_hidden():
     assert extent_of(moving, [stepped]).high == pytest.approx(95.0, abs=0.1)
     shape = structure("prandtl_ishlinskii+lag", moving, beside=[stepped])
     assert shape.system.parts[0].thresholds[-1] == pytest.approx(45.0 * 14 / 11, 0.01)
+
+
+def test_steps_among_several_records_leave_room_for_a_slew_rate():
+    # It may show only behind the fitted hysteresis.
+    stepped, moving = (Record(u, stage(u, None), DT) for u in (STEPS, SINE))
+    assert "slew" not in dynamics_parts(stepped)
+    assert dynamics_parts(stepped, [moving]) == "modes+delay+slew"
+
+
+def test_a_slew_rate_shows_behind_the_hysteresis():
+    u = np.repeat(np.random.default_rng(3).uniform(10.0, 90.0, 14), 150)
+
+    def front_of(input):
+        narrow, wide = (oracle.play(input, r, input[0]) for r in (10.0, 25.0))
+        return 0.05 * input + 0.57 * narrow + 0.95 * wide
+
+    y = stage(front_of(mean_voltages(u, 8e4)), None)
+    # Steps of equal height move the stage by different amounts.
+    assert dynamics_of(Record(u, y, DT)).slew > 2.0 * 8e4
+    assert slew_behind(front_of, u, y, DT) == pytest.approx(8e4, rel=0.05)
+    fast = stage(front_of(u), None)
+    assert slew_behind(front_of, u, fast, DT) is None
+
+
+def test_few_steps_leave_a_slew_rate_that_is_a_guess():
+    wide = np.concatenate([np.full(300, 25.0), SINE])
+    few, many = (Record(u, stage(u, 4e4), DT) for u in (wide, STEPS))
+    fitted = {"drive.rate": FittedParameter(value=3e4, standard_error=50.0)}
+    (warning,) = slew_warning(fitted, [few])
+    assert "3e+04 V/s" in warning
+    assert "is a guess" in warning
+    assert slew_warning(fitted, [many, few]) == []
+    assert slew_warning({}, [few]) == []
 
 
 def test_a_design_leaves_the_slew_limit_out():

@@ -4,6 +4,7 @@ They are those of the Hammerstein model of its liveliest part (``hammerstein``).
 that is negative shows that the output was saved too early.
 """
 
+from collections.abc import Callable
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -97,21 +98,37 @@ def _found_once(input: bytes, output: bytes, dt: float) -> _Found:
     if x.size < SHORTEST:
         return LinearDynamics(), None
     moved = _above_slowest(y)
-
-    def cost(x: np.ndarray) -> float:
-        # One mode and one lag. The plays take long, and steps show the rate without
-        # them.
-        try:
-            model = refined_instrumental_variables(_above_slowest(x), moved, 3, 3)
-        except (ValueError, np.linalg.LinAlgError):
-            return np.inf
-        return float(np.sqrt(model.cost))
-
-    rate = slew_rate(x, cost)
+    # The plays take long, and steps show the rate without them.
+    rate = slew_rate(x, lambda slewed: _simple_cost(slewed, moved))
     x = x if rate is None else slewed(x, rate)
     slopes = 1.0 - 2.0 * np.array(THRESHOLDS)
     found, model = _shown(Signals(_play_outputs(x), slopes, moved), dt)
     return found._replace(slew=None if rate is None else rate / dt), model
+
+
+def _simple_cost(x: np.ndarray, moved: np.ndarray) -> float:
+    """Return the white error of a mode and a lag behind ``x``."""
+    try:
+        model = refined_instrumental_variables(_above_slowest(x), moved, 3, 3)
+    except (ValueError, np.linalg.LinAlgError):
+        return np.inf
+    return float(np.sqrt(model.cost))
+
+
+def slew_behind(
+    front_of: Callable[[np.ndarray], np.ndarray],
+    input: np.ndarray,
+    output: np.ndarray,
+    dt: float,
+) -> float | None:
+    """Return the slew rate (unit of ``input`` per s) that steps show, or None.
+
+    ``front_of`` is the fitted hysteresis behind the amplifier, from its input to its
+    output [samples].
+    """
+    moved = _above_slowest(output)
+    rate = slew_rate(input, lambda slewed: _simple_cost(front_of(slewed), moved))
+    return None if rate is None else rate / dt
 
 
 def samples_early(input: np.ndarray, output: np.ndarray, dt: float) -> float:
