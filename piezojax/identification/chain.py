@@ -30,6 +30,9 @@ DEFAULT = "auto"
 DRIVE = "drive"
 """Place of the part that acts first."""
 
+SLEW = f"{DRIVE}.rate"
+"""Path of the slew rate of the amplifier."""
+
 OFFSET = "calibration.offset"
 """Parameter that stands for the zero of the sensor."""
 

@@ -11,7 +11,7 @@ from ..core.paths import get, parameters, replace
 from ..core.progress import Progress
 from ..core.system import Affine, series
 from ..hysteresis.model import hystereses
-from .chain import OFFSET, by_evidence, structure, unclear_step
+from .chain import OFFSET, SLEW, by_evidence, structure, unclear_step
 from .closed_loop import LoopFit, is_closed, loop_fit
 from .estimators.approach import BEFORE, without_before
 from .estimators.estimate import Estimate, FittedParameter, Options, bound_warning
@@ -37,9 +37,6 @@ EQUAL_LOSS = 1e-3
 AMBIGUOUS = 0.01
 """Spread of a parameter among equally good fits, as a share of its range, above which
 to warn."""
-
-SLEW = "drive.rate"
-"""Path of the slew rate of the amplifier."""
 
 INPUT_BEFORE, ZERO = "input before the record", "zero of"
 """Names of the input in force before a single record, and of the zero of the sensor in

@@ -15,7 +15,7 @@ from jaxtyping import Array
 from ..core.paths import get, replace
 from ..core.progress import Progress
 from ..core.system import Series, System, series
-from .chain import DRIVE, LINEAR, by_evidence, dynamics_of, structure
+from .chain import DRIVE, LINEAR, SLEW, by_evidence, dynamics_of, structure
 from .estimators.approach import run_after
 from .estimators.output_error import ROUGH_STEPS, Optimum, output_error
 from .estimators.resonances import LinearDynamics, dynamics_behind, slew_behind
@@ -132,16 +132,16 @@ def seen_behind(begun: Begun, model: str, records: Sequence[Record]) -> Seen:
     The chain starts at this fit. Its dynamics stay if no resonance shows.
     """
     fit, last = begun
-    first, *beside = records
-    shown = _best(fit, records)
-    if shown.modes:
-        slew = last.slew if shown.slew is None else shown.slew
-        shown = shown._replace(slope=last.slope, slew=slew, input_unit=last.input_unit)
-    else:
-        shown = last
+    (first, *beside), found = records, _best(fit, records)
+    shown = last
+    if found.modes:
+        slew = last.slew if found.slew is None else found.slew
+        shown = found._replace(slope=last.slope, slew=slew, input_unit=last.input_unit)
     again = structure(model, first, beside=beside, shown=shown)
     both = set(fit.problem.space.paths) & set(again.space.paths)
-    values = {path: get(fit.system, path) for path in both - set(again.dynamics)}
+    # A value that is kept may lie outside its new bounds, where a descent is stuck.
+    anew = {*again.dynamics, *([] if found.slew is None else [SLEW])}
+    values = {path: get(fit.system, path) for path in both - anew}
     start = again.space.nearest(replace(again.system, values))
     system = again.system
     if again.linear:

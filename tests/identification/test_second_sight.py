@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from oracles import forty_stages
@@ -9,6 +10,7 @@ from oracles.stages import Parameters, Stage
 
 from piezojax.core.paths import get
 from piezojax.core.progress import Silent
+from piezojax.identification import second_sight
 from piezojax.identification.chain import dynamics_of, structure
 from piezojax.identification.estimators.resonances import dynamics_behind
 from piezojax.identification.records.record import Record
@@ -88,6 +90,17 @@ def test_a_second_look_gives_the_structure_both_modes(records):
         "coleman_hodgdon+modes+delay", records[0], beside=records[1:], shown=seen.shown
     ).starts[0]
     np.testing.assert_array_equal(seen.structure.guess, guess)
+
+
+def test_a_second_look_gives_the_structure_the_slew_rate(records, monkeypatch):
+    # tests/dynamics/test_slew.py has the search itself.
+    monkeypatch.setattr(second_sight, "slew_behind", lambda *_: 1.23e5)
+    part, model = slice(0, records[0].samples), "dahl_frictions+modes+delay+slew"
+    seen = seen_again(model, records, part, Silent(), looks=1)
+    assert seen.shown.slew == 1.23e5
+    shape = seen.structure
+    started = shape.space.put(shape.system, jnp.asarray(shape.starts[0]))
+    assert get(started, "drive.rate") == pytest.approx(1.23e5)
 
 
 def test_several_records_begin_with_a_stage_without_power(records):

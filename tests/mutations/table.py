@@ -500,6 +500,13 @@ MUTATIONS = (
         ("tests/identification/test_second_sight.py",),
     ),
     Mutation(
+        "a slew rate from the first look alone",
+        "identification/second_sight.py",
+        "slew = last.slew if shown.slew is None else shown.slew",
+        "slew = last.slew",
+        ("tests/identification/test_second_sight.py", "tests/dynamics/test_slew.py"),
+    ),
+    Mutation(
         "models of several records compared before their fits settle",
         "identification/automatic.py",
         "if len(begun) > 1 else ()",
