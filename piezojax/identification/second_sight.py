@@ -169,14 +169,13 @@ def _best(fit: Optimum, records: Sequence[Record]) -> LinearDynamics:
 
     The slew rate is that of the first record with steps that show one.
     """
-    system, starts = fit.system, fit.problem.starts
+    system = fit.system
     assert isinstance(system, Series)
-    assert starts is not None
     place = next(i for i, name in enumerate(system.names) if name in LINEAR)
     parts = dict(zip(system.names[:place], system.parts[:place], strict=True))
     amplifier, hysteresis = parts.pop(DRIVE, None), series(**parts)
     found = []
-    for record, levels in zip(records, starts.levels, strict=True):
+    for record, levels in zip(records, fit.starts.levels, strict=True):
 
         def front_of(
             input: np.ndarray, front: System = hysteresis, levels: Array = levels

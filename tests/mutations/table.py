@@ -502,7 +502,7 @@ MUTATIONS = (
     Mutation(
         "a slew rate from the first look alone",
         "identification/second_sight.py",
-        "slew = last.slew if shown.slew is None else shown.slew",
+        "slew = last.slew if found.slew is None else found.slew",
         "slew = last.slew",
         ("tests/identification/test_second_sight.py", "tests/dynamics/test_slew.py"),
     ),

@@ -27,6 +27,7 @@ from ...solve.problem import linearised
 from ..records.record import Record
 from .error_problem import Problem, at_stacked, at_starts, problem_of
 from .free_runs import settled_part, settled_starts, starts_of
+from .linear_start import Start
 from .linear_weights import WeightsFit, with_weights
 from .noise_model import NOISE_ORDER
 from .structure import Prior, Structure
@@ -45,6 +46,9 @@ PASSES = 8
 
 PASSED = 0.95
 """Ratio of the mean squares after two of these fits above which one more is enough."""
+
+SETTLED = 0.05
+"""Relative change of the mean square that ends the fits with whitened errors."""
 
 NOISE_PASSES = 4
 """Largest number of alternate fits of a noise model and the parameters."""
@@ -87,6 +91,13 @@ class Optimum(NamedTuple):
     losses: np.ndarray
     finished: bool
     weights: WeightsFit | None = None
+
+    @property
+    def starts(self) -> Start:
+        """The states before the records, stacked; ValueError if each is at rest."""
+        if self.problem.starts is None:
+            raise ValueError("the fit began at rest")
+        return self.problem.starts
 
     @property
     def system(self) -> System:
@@ -186,20 +197,28 @@ def output_error(
     whole, settled = problem.weights, not several
     weights = begun and begun.weights
     alone = cautious or structure.linear is not None
+
+    def searched(problem: Problem, unit: np.ndarray) -> Problem:
+        """Return ``problem`` with the states before the records found anew."""
+        system = problem.space.put(problem.system, as_array(unit))
+        found, *_ = starts_of(system, records, train)
+        return at_starts(problem.weighted(whole), found)
+
+    def weighed(problem: Problem, unit: np.ndarray, prior: Prior) -> Prior:
+        return _lighter(prior, _first_guess(structure, problem, unit))
+
     for turn in range(passes):
-        if several:
+        if several and begun is not None and not turn:
+            problem = at_stacked(problem, begun.starts)
+        elif several and (turn or structure.linear is None):
+            problem = searched(problem, units[0])
+        elif several:
+            # With the first guess of the weights no state would be right.
             system = problem.space.put(problem.system, as_array(units[0]))
-            if begun is not None and begun.problem.starts is not None and not turn:
-                problem = at_stacked(problem, begun.problem.starts)
-            elif turn or structure.linear is None:
-                found, *_ = starts_of(system, records, train)
-                problem = at_starts(problem.weighted(whole), found)
-            else:
-                # With the first guess of the weights no state would be right.
-                found = settled_starts(system, records, parts)
-                problem = at_starts(problem.only(parts), found)
+            found = settled_starts(system, records, parts)
+            problem = at_starts(problem.only(parts), found)
         if cautious and turn:
-            prior = _lighter(prior, _first_guess(structure, problem, units[0]))
+            prior = weighed(problem, units[0], prior)
             problem = _with_prior(problem, prior)
         last, past = settled or turn == passes - 1, losses[0]
         limit = steps if last and not whitened else rough
@@ -210,19 +229,17 @@ def output_error(
             break
         # The first fit may have no prior or fewer samples: it compares with no other.
         settled = turn > int(alone) and losses[0] > PASSED * past
-    past = np.inf
-    for turn in range(NOISE_PASSES if noise_model else int(whitened) * passes):
-        point = as_array(units[0])
+    past, rounds = np.inf, NOISE_PASSES if noise_model else passes if several else 1
+    for turn in range(rounds if whitened else 0):
         if noise_model:
-            problem = problem.predicting(point)
+            problem = problem.predicting(as_array(units[0]))
         elif not turn:
-            problem = _balanced(problem, point)
-            past = problem.spread(point)[0] ** 2
+            problem = _balanced(problem, as_array(units[0]))
+            past = problem.spread(as_array(units[0]))[0] ** 2 if several else np.inf
         else:
-            system = problem.space.put(problem.system, point)
-            problem = at_starts(problem, starts_of(system, records, train)[0])
+            problem = searched(problem, units[0])
             if cautious:
-                prior = _lighter(prior, _first_guess(structure, problem, units[0]))
+                prior = weighed(problem, units[0], prior)
                 problem = _with_prior(problem, prior)
         if not turn and not known:
             # Errors of the hysteresis may have hidden a resonance from the first fit.
@@ -234,15 +251,12 @@ def output_error(
         problem, units, losses, finished, weights = _descended(
             problem, structure.linear, weights, _inside(units), width, steps, progress
         )
-        if noise_model:
-            left, settled = (
-                losses[0],
-                abs(past - losses[0]) <= NOISE_SETTLED * losses[0],
-            )
-        else:
+        if turn == rounds - 1:
+            break
+        left = losses[0]
+        if not noise_model:
             left = problem.spread(as_array(units[0]))[0] ** 2
-            settled = not several or left > PASSED * past
-        if settled:
+        if abs(past - left) <= (NOISE_SETTLED if noise_model else SETTLED) * left:
             break
         past = left
     if cautious:
