@@ -16,6 +16,11 @@ RAMP = 2.0
 """The same, if the delay may contain the ramp of a step at an unknown slew rate."""
 
 
+BESIDE_LAG = 0.1
+"""Share of a lag by which the delay may change in fits to several records: what they
+show best is the sum of both."""
+
+
 class FractionalDelay(Fittable):
     """``y(t) = x(t - delay)``, interpolated linearly between samples.
 
@@ -47,6 +52,8 @@ class FractionalDelay(Fittable):
         if found is not None and extent.modes:
             # Errors of the hysteresis would bias the delay, as they would bias a mode.
             off = (RAMP if extent.jump else NEAR) * dt
+            if extent.before > 1.0:  # several records
+                off += BESIDE_LAG * sum(extent.lags)
             bounds = Range(max(0.0, starts[0] - off), min(starts[0] + off, 5.0 * dt))
         return Recipe(
             cls(0.5 * dt, dt, 5),

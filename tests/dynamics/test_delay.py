@@ -5,6 +5,7 @@ import pytest
 from piezojax import (
     simulate,
 )
+from piezojax.core.recipe import Extent, Resonance
 from piezojax.dynamics import (
     FractionalDelay,
 )
@@ -39,3 +40,17 @@ def test_a_delay_interpolates_between_samples(samples):
 def test_bad_parameters(arguments, message):
     with pytest.raises(ValueError, match=message):
         FractionalDelay(*arguments)
+
+
+def test_the_delay_of_several_records_may_change_as_much_as_the_lag_beside_it():
+    mode = Resonance(500.0, 0.01, 1.0)
+    alone = Extent(
+        low=0.0, high=100.0, first=(0.0, 0.0), slope=0.1, centre=0.0, span=10.0,
+        dt=5e-5, duration=1.0, modes=(mode,), lags=(9e-4,), delay=1.5e-4,
+    )  # fmt: skip
+    one, several = (
+        FractionalDelay.recipe(extent).bounds["delay"]
+        for extent in (alone, alone._replace(before=1.4))
+    )
+    assert (one.lower, one.upper) == pytest.approx((1.375e-4, 1.625e-4))
+    assert (several.lower, several.upper) == pytest.approx((0.475e-4, 2.5e-4))
