@@ -6,7 +6,6 @@ most of the errors is a start beside the poles that are known already.
 """
 
 import numpy as np
-import scipy.signal
 
 from .refined import TransferFunction
 
@@ -25,6 +24,8 @@ def with_further_mode(
     ``x`` and ``y`` [samples] are the signals to which ``model`` was fitted. Each mode
     of a grid acts on ``x`` with two coefficients, which are fitted to the white errors.
     """
+    import scipy.signal  # takes long to import
+
     driven = scipy.signal.lfilter(model.noise, [1.0], x)
     errors = model.whitened(y - model.applied(x))
     delay, settled = model.delay, x.size - errors.size

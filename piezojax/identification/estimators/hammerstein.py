@@ -61,12 +61,14 @@ the record explains."""
 class Signals(NamedTuple):
     """Outputs of the plays [plays, samples] and of the stage [samples], filtered.
 
-    ``slopes`` [plays] are those of the plays over the full range of the input.
+    ``slopes`` [plays] are those of the plays over the full range of the input. If
+    ``fitted``, the output of a fitted hysteresis takes the place of the plays.
     """
 
     plays: np.ndarray
     slopes: np.ndarray
     output: np.ndarray
+    fitted: bool = False
 
     def later(self, samples: int) -> "Signals":
         """Return the signals with the output delayed by ``samples``."""
@@ -226,7 +228,9 @@ def _fitted(
         known = None if model is None else model.dynamics
         x = weights @ signals.plays
         try:
-            found = refined_instrumental_variables(x, signals.output, *orders, known)
+            found = refined_instrumental_variables(
+                x, signals.output, *orders, known, differences=signals.fitted
+            )
         except (ValueError, np.linalg.LinAlgError):
             return None
         model = Hammerstein(signals, weights, found)
@@ -263,11 +267,11 @@ def _with_mode(model: Hammerstein) -> Hammerstein | None:
     return _fitted(signals, poles // 2 + 1, poles % 2, wider.delay, start)
 
 
-def chosen(signals: Signals, weak: bool = False) -> Hammerstein:
+def chosen(signals: Signals) -> Hammerstein:
     """Return the model with as many modes as lower the error.
 
-    With ``weak``, the modes that the errors show are tried as well. Errors of the plays
-    look like weak modes.
+    Behind a fitted hysteresis the modes that the errors show are tried as well. Errors
+    of the plays look like weak modes.
     """
     best = with_lag(signals, 0)
     chance = np.exp(-EVIDENCE / signals.output.size)
@@ -275,7 +279,7 @@ def chosen(signals: Signals, weak: bool = False) -> Hammerstein:
         if white_error(best) < NEGLIGIBLE * np.std(signals.output):
             break
         model = with_lag(signals, modes)
-        if weak and best is not None:
+        if signals.fitted and best is not None:
             model = min(model, _with_mode(best), key=white_error)
         shown = model is not None and len(model.modes(1.0)) == modes
         if not shown or white_error(model) > min(drop, chance) * white_error(best):

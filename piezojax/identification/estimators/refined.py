@@ -69,6 +69,8 @@ def refined_instrumental_variables(
     zeros: int,
     delay: int = 1,
     start: TransferFunction | None = None,
+    *,
+    differences: bool = False,
 ) -> TransferFunction:
     """Fit a transfer function from ``x`` to ``y`` [samples], both of zero mean.
 
@@ -77,6 +79,10 @@ def refined_instrumental_variables(
     estimate is that of least variance under the errors' own spectrum, and sensor noise
     leaves it unbiased. It starts from least squares, or from ``start`` of the same
     order. The best of all iterations is returned.
+
+    At a high rate past samples are nearly equal. With ``differences`` the equations are
+    those of their differences, which determine more coefficients; without, the rounding
+    errors rule out orders that the errors of ``x`` would make up.
 
     Raises ValueError if the signals do not determine the coefficients.
     """
@@ -87,8 +93,9 @@ def refined_instrumental_variables(
     else:
         a, b = start.denominator, start.numerator
     found: list[TransferFunction] = []
-    # At a high rate past samples are nearly equal, and only their differences tell.
-    basis = scipy.linalg.block_diag(_differences(poles), _differences(zeros + 1))
+    basis = np.eye(poles + zeros + 1)
+    if differences:
+        basis = scipy.linalg.block_diag(_differences(poles), _differences(zeros + 1))
     for _ in range(ITERATIONS):
         model = _with_noise(x, y, a, b, delay)
         found.append(model)

@@ -167,13 +167,15 @@ def dynamics_behind(front: np.ndarray, output: np.ndarray, dt: float) -> LinearD
     x, y = _liveliest(front, output)
     if x.size < SHORTEST:
         return LinearDynamics()
-    signals = Signals(_above_slowest(x)[None], np.ones(1), _above_slowest(y))
-    return _shown(signals, dt, weak=True)[0]
+    signals = Signals(
+        _above_slowest(x)[None], np.ones(1), _above_slowest(y), fitted=True
+    )
+    return _shown(signals, dt)[0]
 
 
-def _shown(signals: Signals, dt: float, weak: bool = False) -> _Found:
+def _shown(signals: Signals, dt: float) -> _Found:
     try:
-        model = chosen(signals, weak)
+        model = chosen(signals)
     except (ValueError, np.linalg.LinAlgError):
         return LinearDynamics(), None
     modes, lags = model.modes(dt), model.lags(dt)
