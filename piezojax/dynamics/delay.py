@@ -15,7 +15,6 @@ NEAR = 0.25
 RAMP = 2.0
 """The same, if the delay may contain the ramp of a step at an unknown slew rate."""
 
-
 BESIDE_LAG = 0.1
 """Share of a lag by which the delay may change in fits to several records: what they
 show best is the sum of both."""

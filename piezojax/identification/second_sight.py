@@ -120,7 +120,8 @@ def seen_again(
         )
         last, seen = seen, seen_behind(Begun(rough, seen.shown), model, records)
         if seen.structure.linear is not None:
-            seen = seen._replace(fit=None)  # a single pass has not searched for them
+            # A single pass with linear weights has not searched for the states.
+            seen = seen._replace(fit=None)
         if _equal(seen.shown, last.shown):
             break
     return seen
