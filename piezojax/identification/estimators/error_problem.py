@@ -72,7 +72,7 @@ class Problem(eqx.Module):
 
         The errors are mostly those of the model, not white noise.
         """
-        errors = np.asarray(self.errors(unit))
+        errors = np.asarray(_errors(self, unit))
         counted = np.asarray(self.weights) > 0.0
         each = [error[used] for error, used in zip(errors, counted, strict=True)]
         rms = np.sqrt(np.mean(np.concatenate(each) ** 2))
@@ -129,7 +129,7 @@ class Problem(eqx.Module):
 
         The first samples, for which the filter lacks earlier errors, do not count.
         """
-        errors, weights = map(np.asarray, (self.errors(unit), self.weights))
+        errors, weights = map(np.asarray, (_errors(self, unit), self.weights))
         counted = [each[used > 0.0] for each, used in zip(errors, weights, strict=True)]
         weights = weights.copy()
         weights[:, :NOISE_ORDER] = 0.0
@@ -144,6 +144,11 @@ class Problem(eqx.Module):
             self,
             (*map(as_array, (whitening_filter(counted), weights, 0.0, 1.0)),),
         )
+
+
+@eqx.filter_jit
+def _errors(problem: Problem, unit: Array) -> Array:
+    return problem.errors(unit)
 
 
 def _bounded(error: Array) -> Array:
