@@ -13,6 +13,9 @@ PLACES = ("hysteresis", "creep", "dynamics", "lag", "delay", "drive")
 """Places of the parts of a chain, in the order in which parts are listed. A drive is
 listed last and acts first."""
 
+LAG_DOUBT = 0.1
+"""Largest relative change that a fit makes to a lag that a record shows."""
+
 
 class Resonance(NamedTuple):
     """Natural frequency (Hz) and damping ratio (1) of a resonance.
@@ -23,6 +26,13 @@ class Resonance(NamedTuple):
     frequency: float
     damping: float
     share: float = 1.0
+
+    @property
+    def poles(self) -> tuple[complex, complex]:
+        """Poles in the s plane, in the unit of the frequency."""
+        turning = 1j * np.sqrt(1.0 - self.damping**2)
+        pole = 2.0 * np.pi * self.frequency * (turning - self.damping)
+        return pole, np.conj(pole)
 
 
 class Extent(NamedTuple):
@@ -58,6 +68,11 @@ class Extent(NamedTuple):
         """Return the extent of the same record with the sign of its output changed."""
         first = self.first[0], -self.first[1]
         return self._replace(slope=-self.slope, centre=-self.centre, first=first)
+
+    @property
+    def several(self) -> bool:
+        """Whether several records are fitted, from an unknown state each."""
+        return self.before > 1.0
 
     @property
     def width(self) -> float:

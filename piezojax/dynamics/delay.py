@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from ..core.arrays import Scalar, ScalarLike, as_array, check
 from ..core.parameter import parameter, sample_time
-from ..core.recipe import Extent, Fittable, Part, Recipe
+from ..core.recipe import LAG_DOUBT, Extent, Fittable, Part, Recipe
 from ..core.space import Range
 
 NEAR = 0.25
@@ -14,10 +14,6 @@ NEAR = 0.25
 
 RAMP = 2.0
 """The same, if the delay may contain the ramp of a step at an unknown slew rate."""
-
-BESIDE_LAG = 0.1
-"""Share of a lag by which the delay may change in fits to several records: what they
-show best is the sum of both."""
 
 
 class FractionalDelay(Fittable):
@@ -51,8 +47,8 @@ class FractionalDelay(Fittable):
         if found is not None and extent.modes:
             # Errors of the hysteresis would bias the delay, as they would bias a mode.
             off = (RAMP if extent.jump else NEAR) * dt
-            if extent.before > 1.0:  # several records
-                off += BESIDE_LAG * sum(extent.lags)
+            if extent.several:  # they show best the sum of the delay and all lags
+                off += LAG_DOUBT * sum(extent.lags)
             bounds = Range(max(0.0, starts[0] - off), min(starts[0] + off, 5.0 * dt))
         return Recipe(
             cls(0.5 * dt, dt, 5),

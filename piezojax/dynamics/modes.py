@@ -9,13 +9,17 @@ from jaxtyping import Array, Float
 
 from ..core.arrays import Scalar, ScalarLike, Scalars, as_array, as_scalars
 from ..core.parameter import parameter, sample_time
-from ..core.recipe import Extent, Fittable, Part, Recipe, scaled_range
+from ..core.recipe import (
+    LAG_DOUBT,
+    Extent,
+    Fittable,
+    Part,
+    Recipe,
+    scaled_range,
+)
 from ..core.space import Range
 from ..core.system import Designed, System
 from .mode import mode_bounds, mode_starts
-
-LAG_SHARES = (0.9, 1.1)
-"""Bounds of a time constant, as multiples of the one estimated from the record."""
 
 SHARE_OFF = 0.05
 """Largest change that a fit makes to the share of a mode estimated from the record."""
@@ -101,8 +105,9 @@ class Modes(Designed, Fittable):
             bounds |= {f"{path}.{i}": bound for path, bound in near.items()}
         for i, mode in enumerate(modes[1:]):
             bounds[f"share.{i}"] = Range(mode.share - SHARE_OFF, mode.share + SHARE_OFF)
+        near = 1.0 - LAG_DOUBT, 1.0 + LAG_DOUBT
         for i, lag in enumerate(extent.lags):
-            bounds[f"time_constant.{i}"] = scaled_range(lag, *LAG_SHARES)
+            bounds[f"time_constant.{i}"] = scaled_range(lag, *near)
         return Recipe(system, bounds)
 
     def resolved(self) -> "HeldLinear":

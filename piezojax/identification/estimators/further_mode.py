@@ -7,6 +7,7 @@ most of the errors is a start beside the poles that are known already.
 
 import numpy as np
 
+from ...core.recipe import Resonance
 from .refined import TransferFunction
 
 CYCLES = tuple(np.geomspace(4e-3, 0.4, 60))
@@ -37,7 +38,11 @@ def with_further_mode(
         amounts, *_ = np.linalg.lstsq(columns, errors, rcond=None)
         return float(np.sum((errors - columns @ amounts) ** 2)), amounts
 
-    pairs = [_pair(cycles, damping) for cycles in CYCLES for damping in DAMPINGS]
+    pairs = [
+        np.real(np.poly(np.exp(Resonance(cycles, damping).poles)))
+        for cycles in CYCLES
+        for damping in DAMPINGS
+    ]
     left, fitted = zip(*map(explained, pairs), strict=True)
     best = int(np.argmin(left))
     poles, amounts = pairs[best], fitted[best]
@@ -47,10 +52,3 @@ def with_further_mode(
     return model._replace(
         numerator=numerator, denominator=np.convolve(model.denominator, poles)
     )
-
-
-def _pair(cycles: float, damping: float) -> np.ndarray:
-    """Return the denominator of a mode."""
-    turning = 1j * np.sqrt(1.0 - damping**2)
-    pole = np.exp(2.0 * np.pi * cycles * (turning - damping))
-    return np.array([1.0, -2.0 * pole.real, abs(pole) ** 2])

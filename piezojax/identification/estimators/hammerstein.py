@@ -181,19 +181,12 @@ class Hammerstein(NamedTuple):
         turn = np.exp(-2j * np.pi * cycles)
         slow = [complex(-1.0 / lag) for lag in lags]
         held = sum(
-            (mode.share * _held([*_rates(mode), *slow], dt, turn) for mode in modes),
+            (mode.share * _held([*mode.poles, *slow], dt, turn) for mode in modes),
             np.zeros(cycles.size) if modes else _held(slow, dt, turn),
         )
         rest = self.dynamics.response(cycles) / turn / held
         phase = np.unwrap(np.angle(rest * np.sign(np.real(rest[0]))))
         return float(-(phase @ cycles) / (2.0 * np.pi * cycles @ cycles) * dt)
-
-
-def _rates(mode: Resonance) -> tuple[complex, complex]:
-    """Return the poles of a mode in the s plane, 1/s."""
-    turning = 1j * np.sqrt(1.0 - mode.damping**2)
-    rate = 2.0 * np.pi * mode.frequency * (turning - mode.damping)
-    return rate, np.conj(rate)
 
 
 def _held(rates: Sequence[complex], dt: float, turn: np.ndarray) -> np.ndarray:

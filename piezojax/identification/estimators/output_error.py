@@ -204,8 +204,12 @@ def output_error(
         found, *_ = starts_of(system, records, train)
         return at_starts(problem.weighted(whole), found)
 
-    def weighed(problem: Problem, unit: np.ndarray, prior: Prior) -> Prior:
-        return _lighter(prior, _first_guess(structure, problem, unit))
+    def weighed(
+        problem: Problem, unit: np.ndarray, prior: Prior
+    ) -> tuple[Problem, Prior]:
+        """Return ``problem`` with the prior for its errors, and this prior."""
+        prior = _lighter(prior, _first_guess(structure, problem, unit))
+        return _with_prior(problem, prior), prior
 
     for turn in range(passes):
         if several and begun is not None and not turn:
@@ -218,8 +222,7 @@ def output_error(
             found = settled_starts(system, records, parts)
             problem = at_starts(problem.only(parts), found)
         if cautious and turn:
-            prior = weighed(problem, units[0], prior)
-            problem = _with_prior(problem, prior)
+            problem, prior = weighed(problem, units[0], prior)
         last, past = settled or turn == passes - 1, losses[0]
         limit = steps if last and not whitened else rough
         problem, units, losses, finished, weights = _descended(
@@ -239,8 +242,7 @@ def output_error(
         else:
             problem = searched(problem, units[0])
             if cautious:
-                prior = weighed(problem, units[0], prior)
-                problem = _with_prior(problem, prior)
+                problem, prior = weighed(problem, units[0], prior)
         if not turn and not known:
             # Errors of the hysteresis may have hidden a resonance from the first fit.
             dynamics = [problem.space.paths.index(path) for path in structure.dynamics]
