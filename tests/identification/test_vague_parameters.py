@@ -7,6 +7,7 @@ from oracles import hysteresis as oracle
 
 from piezojax import Record
 from piezojax.identification.chain import structure
+from piezojax.identification.estimators import error_problem
 from piezojax.identification.estimators import output_error as fits
 from piezojax.identification.estimators.error_problem import at_starts, problem_of
 from piezojax.identification.estimators.free_runs import starts_of
@@ -63,7 +64,7 @@ def test_the_weight_is_that_of_one_independent_sample(shape, records, monkeypatc
     fitted, problem = problem_at_first_guess(shape, records)
     time = np.arange(SAMPLES)
     sines = np.stack([0.3 * np.sin(2.0 * np.pi * k * time / SAMPLES) for k in (3, 50)])
-    monkeypatch.setattr(type(problem), "errors", lambda self, unit: sines)
+    monkeypatch.setattr(error_problem, "_errors", lambda problem, unit: sines)
     found = fits._first_guess(fitted, problem, fitted.starts[0])
     np.testing.assert_array_equal(found.known, fitted.starts[0])
     # A sine has one line: two independent numbers, its sine and its cosine.
@@ -76,7 +77,7 @@ def test_the_weight_is_that_of_one_independent_sample(shape, records, monkeypatc
     )
     assert not found.weights[np.logical_not(held)].any()
     white = np.random.default_rng(0).standard_normal((2, SAMPLES))
-    monkeypatch.setattr(type(problem), "errors", lambda self, unit: white)
+    monkeypatch.setattr(error_problem, "_errors", lambda problem, unit: white)
     found = fits._first_guess(fitted, problem, fitted.starts[0])
     # The lines of white noise differ by chance: half as many count.
     assert found.weights.max() == pytest.approx(
