@@ -201,6 +201,7 @@ def counted(monkeypatch, stop=None):
     return models
 
 
+@pytest.mark.usefixtures("optimised")
 @pytest.mark.parametrize("records", [[RICH], [RICH, RICH]])
 def test_an_interrupted_search_goes_on(records, made, monkeypatch, tmp_path):
     made({"bouc_wen": ValueError("fails")})

@@ -20,6 +20,9 @@ from piezojax.identification.estimators.output_error import (
 )
 from piezojax.identification.records.record import Record
 
+# The programs run long: a density has 300 weights.
+pytestmark = pytest.mark.usefixtures("optimised")
+
 DT, SAMPLES, NOISE, LAG = 1e-3, 600, 2e-3, 4e-3
 MODEL = "preisach+lag"
 CELLS, LOW, HIGH = 12, 0.0, 100.0

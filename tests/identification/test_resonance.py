@@ -98,6 +98,7 @@ def test_without_a_resonance_no_output_is_early():
     assert samples_early(input[:100], output[:100], DT) == 0.0
 
 
+@pytest.mark.usefixtures("optimised")
 @pytest.mark.parametrize(("number", "early"), [(14, 0.5), (12, 2.0)])
 def test_an_early_output_of_another_class_has_an_alarm(number, early):
     """The stages have 1.5 samples of delay and none; their outputs are 2 ahead."""
