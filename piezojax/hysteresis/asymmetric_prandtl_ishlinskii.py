@@ -10,11 +10,11 @@ from ..core.recipe import Extent, Fittable, Part, Recipe, rest_starts, scaled_ra
 from .inverse import Inverse, InverseHysteresis
 from .model import Hysteresis, Laws, turning_point_laws
 from .plays import (
-    PLAYS,
     Memory,
     advance_plays,
     check_plays,
     plays_recipe,
+    plays_within,
     polynomial_part,
     typical_distances,
     weighted_sum,
@@ -37,7 +37,7 @@ class AsymmetricPrandtlIshlinskii(Hysteresis, Fittable):
     part: ClassVar[Part] = Part(
         "asymmetric_prandtl_ishlinskii",
         "hysteresis",
-        "Prandtl-Ishlinskii with ten more plays that skew the loop",
+        "Prandtl-Ishlinskii with as many more plays that skew the loop",
     )
 
     polynomial: Scalars = parameter(
@@ -87,7 +87,8 @@ class AsymmetricPrandtlIshlinskii(Hysteresis, Fittable):
     def recipe(cls, extent: Extent) -> Recipe:
         fields, bounds = plays_recipe(extent)
         skews = {
-            f"skew.{i}": scaled_range(extent.slope, -2.0, 2.0) for i in range(PLAYS)
+            f"skew.{i}": scaled_range(extent.slope, -2.0, 2.0)
+            for i in range(plays_within(extent))
         }
         # Plays that are wider than the cycles have no skew.
         none = (0.0,) * len(fields["thresholds"])

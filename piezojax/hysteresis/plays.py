@@ -17,9 +17,9 @@ Memory = tuple[Scalar, ...]
 ITERATIONS = 20
 """Newton steps for a polynomial P; bisection replaces one that leaves the bracket."""
 
-PLAYS = 10
+PLAYS, FINER = 10, 2
 """Operators of a fitted Prandtl-Ishlinskii model that move in every cycle over the
-range of a record."""
+range of a record, and factor by which they are closer for several records."""
 
 
 def advance_plays(input: Scalar, memory: Memory, thresholds: Memory) -> Memory:
@@ -60,13 +60,21 @@ def check_plays(thresholds: Memory, weights: Memory, name: str = "weights") -> N
         )
 
 
+def plays_within(extent: Extent) -> int:
+    """Return the number of operators that move in every cycle over the range.
+
+    Several records determine more of them than one.
+    """
+    return FINER * (PLAYS + 1) - 1 if extent.several else PLAYS
+
+
 def typical_distances(extent: Extent, bounds: Iterable[str]) -> dict[str, float]:
     """Return typical distances (um/V) of weights of plays from their first guesses.
 
     ``bounds`` are the paths of the fitted parameters, which include these weights.
     """
     weights = [path for path in bounds if path.startswith(("weights.", "skew."))]
-    return dict.fromkeys(weights, 0.02 * abs(extent.slope))
+    return dict.fromkeys(weights, 0.2 * abs(extent.slope) / plays_within(extent))
 
 
 def plays_recipe(extent: Extent) -> tuple[dict[str, Any], dict[str, Range]]:
@@ -76,15 +84,15 @@ def plays_recipe(extent: Extent) -> tuple[dict[str, Any], dict[str, Range]]:
     cycles. If the input had a wider range before the records, such a play may still
     move when the input first exceeds the extrema since then.
     """
-    width, slope = extent.width, extent.slope
-    count = round(extent.before * (PLAYS + 1)) - 1
-    thresholds = 0.5 * width * np.arange(1, count + 1) / (PLAYS + 1)
+    width, slope, plays = extent.width, extent.slope, plays_within(extent)
+    count = round(extent.before * (plays + 1)) - 1
+    thresholds = 0.5 * width * np.arange(1, count + 1) / (plays + 1)
     scales = [slope / width**i for i in range(3)]
     return (
         {
             "polynomial": (0.7 * slope, 0.0, 0.0),
             "thresholds": thresholds,
-            "weights": (0.3 * slope / PLAYS,) * count,
+            "weights": (0.3 * slope / plays,) * count,
             "rest_input": extent.first[0],
         },
         {

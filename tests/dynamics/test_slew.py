@@ -132,7 +132,7 @@ def test_a_record_beside_it_tells_that_a_slew_rate_may_be_hidden():
     assert extent_of(moving, [stepped]).jump == pytest.approx(25.0)
     assert extent_of(moving, [stepped]).high == pytest.approx(95.0, abs=0.1)
     shape = structure("prandtl_ishlinskii+lag", moving, beside=[stepped])
-    assert shape.system.parts[0].thresholds[-1] == pytest.approx(45.0 * 14 / 11, 0.01)
+    assert shape.system.parts[0].thresholds[-1] == pytest.approx(45.0 * 30 / 22, 0.01)
 
 
 def test_steps_among_several_records_leave_room_for_a_slew_rate():
