@@ -194,7 +194,8 @@ def _for_several(
     for name, last in [*begun.items()] if len(begun) > 1 else ():
         seen = seen_behind(last, chains[name], records)
         found = fit(seen.structure, seen.fit, LATER_PASSES)
-        if found is not None:
+        # The dynamics that show behind a fit may be worse than those it began with.
+        if found is not None and found.losses[0] < last.fit.losses[0]:
             fits[name], begun[name] = found, Begun(found, seen.shown)
     best = _best((_best(FROM_SEVERAL, error), DENSITY), error)
     return Chosen(best, begun.get(best))

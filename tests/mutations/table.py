@@ -514,6 +514,13 @@ MUTATIONS = (
         ("tests/identification/test_automatic.py",),
     ),
     Mutation(
+        "a longer fit that takes the place of a better one",
+        "identification/automatic.py",
+        "found is not None and found.losses[0] < last.fit.losses[0]",
+        "found is not None",
+        ("tests/identification/test_automatic.py",),
+    ),
+    Mutation(
         "weights that are fitted at a poor guess of the dynamics",
         "identification/estimators/output_error.py",
         "units = np.concatenate([units[:1], again])",
