@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..core.arrays import as_array
 from ..core.paths import get, replace
 from ..core.progress import Progress
 from ..core.system import Series, System, series
@@ -133,18 +134,19 @@ def seen_behind(begun: Begun, model: str, records: Sequence[Record]) -> Seen:
     The chain starts at this fit. Its dynamics stay if no resonance shows.
     """
     fit, last = begun
-    (first, *beside), found = records, _best(fit, records)
+    (first, *beside), behind = records, _best(fit, records)
     shown = last
-    if found.modes:
-        slew = last.slew if found.slew is None else found.slew
-        shown = found._replace(slope=last.slope, slew=slew, input_unit=last.input_unit)
+    if behind.modes:
+        slew = last.slew if behind.slew is None else behind.slew
+        shown = behind._replace(slope=last.slope, slew=slew, input_unit=last.input_unit)
     again = structure(model, first, beside=beside, shown=shown)
     both = set(fit.problem.space.paths) & set(again.space.paths)
     # A value that is kept may lie outside its new bounds, where a descent is stuck.
-    anew = {*again.dynamics, *([] if found.slew is None else [SLEW])}
+    anew = {*again.dynamics, *([] if behind.slew is None else [SLEW])}
     values = {path: get(fit.system, path) for path in both - anew}
-    start = again.space.nearest(replace(again.system, values))
     system = again.system
+    found = again.space.put(system, as_array(again.starts[0]))
+    start = again.space.nearest(replace(found, values))
     if again.linear:
         weights = get(fit.system, again.linear.path)
         system = replace(system, {again.linear.path: weights})

@@ -101,6 +101,10 @@ def test_a_second_look_gives_the_structure_the_slew_rate(records, monkeypatch):
     shape = seen.structure
     started = shape.space.put(shape.system, jnp.asarray(shape.starts[0]))
     assert get(started, "drive.rate") == pytest.approx(1.23e5)
+    # A part without a found delay has half a sample; the stage has one.
+    assert get(started, "delay.delay") == pytest.approx(seen.shown.delay, rel=1e-6)
+    dynamics = [shape.space.paths.index(path) for path in shape.dynamics]
+    np.testing.assert_allclose(shape.starts[0][dynamics], shape.guess[dynamics])
 
 
 def test_several_records_begin_with_a_stage_without_power(records):

@@ -502,9 +502,16 @@ MUTATIONS = (
     Mutation(
         "a slew rate from the first look alone",
         "identification/second_sight.py",
-        "slew = last.slew if found.slew is None else found.slew",
+        "slew = last.slew if behind.slew is None else behind.slew",
         "slew = last.slew",
         ("tests/identification/test_second_sight.py", "tests/dynamics/test_slew.py"),
+    ),
+    Mutation(
+        "a second look that starts at the defaults of its parts",
+        "identification/second_sight.py",
+        "nearest(replace(found, values))",
+        "nearest(replace(system, values))",
+        ("tests/identification/test_second_sight.py",),
     ),
     Mutation(
         "models of several records compared before their fits settle",
