@@ -63,9 +63,9 @@ STEPS, PASSES, LATER_PASSES = 24, 3, 8
 """Number of steps of each fit of a trial; number of its fits to several records at
 first, and most further ones of those that are ``CLOSE``."""
 
-CLOSE = 2.0
+CLOSE = 4.0
 """Ratio to the least error below which the first fits do not decide: those of frictions
-converge slowly."""
+and of many plays converge slowly."""
 
 
 class Chosen(NamedTuple):
