@@ -8,13 +8,16 @@ import pytest
 from piezojax import Record, identify
 from piezojax.catalog import p753
 from piezojax.core.paths import replace
+from piezojax.core.system import series
+from piezojax.dynamics import FirstOrderLag
+from piezojax.hysteresis import PrandtlIshlinskii, Preisach, RateDependentPreisach
 from piezojax.identification import free_run
 from piezojax.identification.chain import structure
 from piezojax.identification.estimators import output_error
-from piezojax.identification.estimators.approach import run_after
+from piezojax.identification.estimators.approach import TURNS, run_after
 from piezojax.identification.estimators.error_problem import at_starts, problem_of
 from piezojax.identification.estimators.free_runs import starts_of
-from piezojax.identification.estimators.linear_start import start_columns
+from piezojax.identification.estimators.linear_start import Start, start_columns
 
 MODEL = "coleman_hodgdon+arma"
 
@@ -77,6 +80,24 @@ def test_residuals_of_records_of_different_length_exclude_the_padding():
     expected = squares / (80 + 140)
     residuals = jax.jit(lambda u: problem.residuals(u))(unit)
     np.testing.assert_allclose(jnp.sum(residuals**2), expected, rtol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "hysteresis",
+    [
+        Preisach(np.eye(6), 0.0, 100.0),
+        RateDependentPreisach(Preisach(np.eye(6), 0.0, 100.0), np.eye(6), 10.0, 1e-3),
+        PrandtlIshlinskii((0.1,), (5.0, 10.0, 20.0, 30.0), (0.01,) * 4),
+    ],
+)
+def test_only_linear_states_are_corrected_before_a_record(hysteresis):
+    # The path before the record gives the memory of a hysteresis.
+    system = series(hysteresis=hysteresis, lag=FirstOrderLag(2e-3, 1e-3))
+    u = 50.0 + 15.0 * jnp.sin(0.1 * jnp.arange(100.0))
+    start = Start(jnp.full(TURNS, 50.0), jnp.array([35.0, 65.0]), jnp.asarray(1.0))
+    zero, *states = np.asarray(start_columns(system, u, start))[..., 0]
+    np.testing.assert_allclose(zero, 1.0)
+    assert len(states) == 1
 
 
 def test_the_gradient_of_the_squares_is_right_at_the_most_likely_starts():

@@ -40,17 +40,17 @@ def linear_responses(
     ``levels`` determines its state. One with at most ``few`` states is treated as
     linear, because its memory fades nearly linearly along the path of the input.
     """
-    system = resolve(system)  # once for all motions and runs
-    state = state_after(system, inputs[0], levels)
+    law = resolve(system)  # once for all motions and runs
+    state = state_after(law, inputs[0], levels)
     flat, unravel = ravel_pytree(_linear_states(system, state, few))
     rests = [
-        ravel_pytree(_linear_states(system, system.init(end), few))[0] for end in ends
+        ravel_pytree(_linear_states(system, law.init(end), few))[0] for end in ends
     ]
     size = jnp.abs(rests[1] - rests[0])
 
     def run(linear: Array) -> Array:
         moved = _with_linear(system, state, unravel(linear), few)
-        return run_from(system, inputs, moved)
+        return run_from(law, inputs, moved)
 
     def response(deviation: Array) -> Array:
         return jax.jvp(run, (flat,), (deviation,))[1]
