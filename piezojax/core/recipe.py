@@ -1,8 +1,8 @@
 """Declarations of models that can be fitted: place in a chain, first guess, bounds."""
 
 import abc
-from collections.abc import Mapping, Sequence
-from typing import ClassVar, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -86,13 +86,16 @@ class LinearWeights(NamedTuple):
     ``path`` is that of an array, ``places`` the positions of its k free elements, an
     index array for each axis. ``least`` [k] are their lower bounds. Each row of
     ``differences`` [pairs, k] is that between two neighbours, as a multiple of its
-    typical size.
+    typical size. ``responses`` takes the System, inputs [samples] that begin at rest,
+    and some of the places; it returns the outputs [places, samples] that a weight of 1
+    at each adds.
     """
 
     path: str
     places: tuple[np.ndarray, ...]
     least: np.ndarray
     differences: np.ndarray
+    responses: Callable[[Any, Any, Sequence[Any]], Any]
 
 
 class Recipe(NamedTuple):

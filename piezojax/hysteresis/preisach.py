@@ -1,12 +1,14 @@
 """Preisach hysteresis with a density on a triangle of cells, and its exact inverse."""
 
+from collections.abc import Sequence
 from functools import partial
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from ..core.arrays import (
@@ -40,7 +42,7 @@ STARTS = ("virgin", "saturated")
 """Initial states of the material."""
 
 
-CELLS, SHARE = 24, 0.3
+CELLS, SHARE = 36, 0.3
 """Cells per side of a fit, and the share of the output that they add to the diagonal
 in the first guess."""
 
@@ -82,7 +84,7 @@ class Preisach(Hysteresis, Fittable, Designed):
 
     laws: ClassVar[Laws] = turning_point_laws()
     part: ClassVar[Part] = Part(
-        "preisach", "hysteresis", "Preisach: a smooth density on a triangle of 24 cells"
+        "preisach", "hysteresis", "Preisach: a smooth density on a triangle of 36 cells"
     )
     rising: ClassVar[bool] = True
 
@@ -103,6 +105,26 @@ class Preisach(Hysteresis, Fittable, Designed):
     def cells(self) -> int:
         """Cells along one side of the triangle."""
         return self.weights.shape[0]
+
+    def responses(
+        self,
+        inputs: Float[Array, " samples"],
+        places: Sequence[Array | np.ndarray],
+    ) -> Float[Array, "k samples"]:
+        """Return the outputs under ``inputs`` (V) of 1 um in each of k cells.
+
+        ``places`` are the indices of alpha and of beta. The model rests under the first
+        input. Its own weights do not matter.
+        """
+        law = self.resolved()
+
+        def advanced(levels: Levels, input: Scalar) -> tuple[Levels, Levels]:
+            levels = law.advance(levels, input)
+            return levels, levels
+
+        _, levels = jax.lax.scan(advanced, law.init(inputs[0]), inputs)
+        alpha, beta = places
+        return jnp.clip(levels.T[alpha - beta] - beta[:, None], 0.0, 1.0)
 
     def resolved(self) -> "PlayLines":
         rows = rows_of(self.weights)
@@ -141,6 +163,7 @@ class Preisach(Hysteresis, Fittable, Designed):
                 places,
                 np.where(diagonal, LEAST_SLOPE * rise / CELLS, 0.0),
                 differences / (0.5 * np.abs(differences) @ weights[places])[:, None],
+                cls.responses,
             ),
         )
 
@@ -229,13 +252,42 @@ def outputs(levels: Levels, *densities: Rows) -> tuple[Levels, ...]:
 
     Reverse mode recomputes it, which is four times faster than storing it.
     """
-    totals = [jnp.zeros_like(levels) for _ in densities]
-    for beta, weights in enumerate(zip(*densities, strict=True)):
+    return tuple(_raised(levels, rows) for rows in densities)
+
+
+@jax.custom_jvp
+def _raised(levels: Levels, rows: Rows) -> Levels:
+    total = jnp.zeros_like(levels)
+    for beta, own in enumerate(rows):
         along = levels - beta
-        # Unlike jnp.clip, this has the slope of the upper cell at an edge.
         up = jnp.where(along < 0.0, 0.0, jnp.where(along < 1.0, along, 1.0))
-        totals = [t + own * up for t, own in zip(totals, weights, strict=True)]
-    return tuple(totals)
+        total = total + own * up
+    return total
+
+
+def _steepness(levels: Levels, rows: Rows) -> Levels:
+    """Return the slope of the lines, at an edge that of the upper cell."""
+    total = jnp.zeros_like(levels)
+    for beta, own in enumerate(rows):
+        along = levels - beta
+        total = total + jnp.where((along >= 0.0) & (along < 1.0), own, 0.0)
+    return total
+
+
+@partial(_raised.defjvp, symbolic_zeros=True)
+def _raised_jvp(primals: Any, tangents: Any) -> tuple[Levels, Levels]:
+    """All directions share one slope: without this rule each passes all cells."""
+    (levels, rows), (moved, changed) = primals, tangents
+    tangent = jnp.zeros_like(levels)
+    if not isinstance(moved, SymbolicZero):
+        tangent = tangent + _steepness(levels, rows) * moved
+    if not all(isinstance(row, SymbolicZero) for row in changed):
+        rows_moved = tuple(
+            jnp.zeros(row.shape) if isinstance(row, SymbolicZero) else row
+            for row in changed
+        )
+        tangent = tangent + _raised(levels, rows_moved)
+    return _raised(levels, rows), tangent
 
 
 class PlayLines(System):

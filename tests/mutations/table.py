@@ -537,9 +537,17 @@ MUTATIONS = (
     Mutation(
         "weights whose prior follows errors that it has made itself",
         "identification/estimators/linear_weights.py",
-        "min(fit.scale, rms / np.sqrt(independent))",
-        "rms / np.sqrt(independent)",
+        "light.best_at(free, light.likeliest_scale(free))",
+        "first.best_at(free, first.likeliest_scale(free))",
         ("tests/identification/test_linear_weights.py",),
+    ),
+    Mutation(
+        "a memory that is corrected before a record like a linear state",
+        "identification/estimators/linear_start.py",
+        "count = sum(leaf.size for leaf in jax.tree.leaves(state))\n"
+        "    return not hystereses(system) or count <= few",
+        "return True",
+        ("tests/identification/test_output_error.py",),
     ),
     Mutation(
         "standard errors that take fitted weights for known ones",

@@ -71,8 +71,20 @@ def run_after(
     signals takes [samples] and [turns], and returns [samples].
     """
     system = resolve(system)  # once for the start and the run
-    path = jnp.concatenate([*_motion(inputs[0], levels), inputs[:1], inputs])
+    path = path_after(inputs, levels)
     outputs = run_outputs(system, path, system.init(levels[0]))
+    return recorded(outputs)
+
+
+def path_after(
+    inputs: Float[Array, " samples *m"], levels: Float[Array, " turns *m"]
+) -> Array:
+    """Return ``inputs`` behind the motion over ``levels``, from which it starts."""
+    return jnp.concatenate([*_motion(inputs[0], levels), inputs[:1], inputs])
+
+
+def recorded(outputs: Array) -> Array:
+    """Return those of the ``outputs`` under a ``path_after`` that are in the record."""
     return outputs[TURNS * SAMPLES : -1]
 
 

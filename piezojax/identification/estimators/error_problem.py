@@ -1,6 +1,6 @@
 """The errors of free runs of several records as a problem of least squares."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -43,21 +43,32 @@ class Problem(eqx.Module):
         return self._errors_and_starts(unit)[0]
 
     def _errors_and_starts(self, unit: Array) -> tuple[Array, Array]:
+        system = self.space.put(self.system, unit)
+        return self._corrected(self._runs(system), system)
+
+    def _runs(self, system: System) -> Array:
+        """Return the run [records, samples] of every record, without corrections."""
+        if self.starts is None:
+            return jax.vmap(lambda input: from_rest(system, input))(self.inputs)
+
+        def run(input: Array, start: Start) -> Array:
+            return run_after(system, input, start.levels).reshape(-1)
+
+        return jax.vmap(run)(self.inputs, self.starts)
+
+    def _corrected(self, runs: Array, system: System) -> tuple[Array, Array]:
         """Return the errors, and the prior residuals of the state before each record.
 
         The columns of the starts are not differentiated: at the most likely amounts the
         gradient of the squares does not depend on them (variable projection as in
         Kaufman, BIT 15, 1975, 49-57).
         """
-        system = self.space.put(self.system, unit)
         if self.starts is None:
-            runs = jax.vmap(lambda input: from_rest(system, input))(self.inputs)
             return runs - self.outputs, jnp.zeros((len(self.inputs), 0))
         held = jax.lax.stop_gradient(system)
 
-        def one(input, output, weights, start):
-            run = run_after(system, input, start.levels).reshape(-1, 1)
-            error = _bounded(output[:, None] - run)
+        def one(run, input, output, weights, start):
+            error = _bounded(output - run)[:, None]
             columns = start_columns(held, input, start)
             counted = (weights > 0.0).astype(error.dtype)
             amounts = most_likely(columns, error, counted, start.variance)
@@ -65,7 +76,7 @@ class Problem(eqx.Module):
             spread = jnp.sqrt(start.variance) * jnp.max(weights)
             return error, spread * amounts[1:]
 
-        return jax.vmap(one)(self.inputs, self.outputs, self.weights, self.starts)
+        return jax.vmap(one)(runs, self.inputs, self.outputs, self.weights, self.starts)
 
     def spread(self, unit: Float[Array, " n"]) -> tuple[float, float]:
         """Return the rms error, and the number of independent errors.
@@ -85,7 +96,9 @@ class Problem(eqx.Module):
 
         One in ``every`` of them stands for the others.
         """
-        error, unlikely = self._errors_and_starts(unit)
+        return self._counted(*self._errors_and_starts(unit), unit, every)
+
+    def _counted(self, error: Array, unlikely: Array, unit: Array, every: int) -> Array:
         error = _bounded(error)
         weights = every**0.5 * self.weights
         counted = [(self.plain * weights * error)[:, ::every], unlikely]
@@ -95,6 +108,20 @@ class Problem(eqx.Module):
             known, weights = self.prior
             counted.append(weights * (unit - known))
         return jnp.concatenate([part.ravel() for part in counted])
+
+    def effect_of(
+        self, unit: Float[Array, " n"], every: int = 1
+    ) -> Callable[[Array], Array]:
+        """Return the change of the ``residuals`` as a function of one of the runs.
+
+        It takes the change [records, samples] of the outputs of the System.
+        """
+        system = self.space.put(self.system, unit)
+
+        def residuals(runs: Array) -> Array:
+            return self._counted(*self._corrected(runs, system), unit, every)
+
+        return jax.linearize(residuals, self._runs(system))[1]
 
     def whitened(
         self, error: Float[Array, "records samples"]

@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -11,9 +12,12 @@ from ...core.arrays import as_array
 from ...core.paths import get, replace
 from ...core.recipe import LinearWeights
 from ...core.space import squash
-from ...solve.multi_start import in_batches
+from ...core.system import Series
+from ...engines import run_outputs
 from ...solve.problem import linearised
+from .approach import path_after, recorded
 from .error_problem import Problem
+from .linear_start import Start
 
 ROWS = 20_000
 """Number of errors that are used: neighbouring ones of a long record tell the same."""
@@ -21,24 +25,31 @@ ROWS = 20_000
 WIDTH = 60
 """Number of weights whose effects are computed together."""
 
-ROUNDS = 2
-"""Number of solutions, each as smooth as the errors of the one before demand."""
+LIGHT = 1e-3
+"""Scale of a prior that hardly raises the errors, times that of the first ones."""
+
+SCALES = np.geomspace(1e-2, 1e2, 81)
+"""Scales of the prior among which one is chosen, times that of the errors."""
 
 
 class WeightsFit(NamedTuple):
     """A problem whose weights are fitted, and again at every other point of the box.
 
-    ``effects`` [rows, k] are the changes of the residuals by each weight, and
-    ``smoothing`` [pairs, k] the differences between neighbours times ``scale`` (unit of
-    the output). The weights are ``above`` their lower bounds.
+    The changes of the residuals by each weight, [rows, k], are ``basis`` [rows, k], of
+    orthonormal columns, times ``factor`` [k, k]. ``smoothing`` [pairs, k] are the
+    differences between neighbours times ``scale`` (unit of the output). The weights are
+    ``above`` their lower bounds; ``inverse`` is that of the curvature in those that are
+    not at them.
     """
 
     problem: Problem
     linear: LinearWeights
-    effects: np.ndarray
-    smoothing: np.ndarray
+    basis: np.ndarray
+    factor: np.ndarray
     above: np.ndarray
-    scale: float
+    smoothing: np.ndarray = np.zeros((0, 0))
+    scale: float = np.inf
+    inverse: np.ndarray = np.zeros((0, 0))
 
     def normal_equations(
         self, points: Float[Array, "points n"]
@@ -50,22 +61,21 @@ class WeightsFit(NamedTuple):
         49-57). The loss is half the sum of the squares of residuals and differences.
         """
         active = self.above > 0.0
-        effects, smoothing = self.effects[:, active], self.smoothing[:, active]
-        inverse = np.linalg.pinv(
-            effects.T @ effects + smoothing.T @ smoothing, hermitian=True
-        )
+        factor, smoothing = self.factor[:, active], self.smoothing[:, active]
         rough = self.smoothing @ (self.linear.least + self.above)
         found = []
         for free in points:
             slopes, errors = self._linearised(free)
-            change = -inverse @ (effects.T @ errors + smoothing.T @ rough)
-            left, bent = errors + effects @ change, rough + smoothing @ change
-            crossed = effects.T @ slopes
+            slope = factor.T @ (self.basis.T @ errors) + smoothing.T @ rough
+            change = -self.inverse @ slope
+            left = errors + self.basis @ (factor @ change)
+            bent = rough + smoothing @ change
+            crossed = factor.T @ (self.basis.T @ slopes)
             found.append(
                 (
                     0.5 * (left @ left + bent @ bent),
                     slopes.T @ left,
-                    slopes.T @ slopes - crossed.T @ inverse @ crossed,
+                    slopes.T @ slopes - crossed.T @ self.inverse @ crossed,
                 )
             )
         loss, gradient, curvature = zip(*found, strict=True)
@@ -75,20 +85,81 @@ class WeightsFit(NamedTuple):
         """Return the fit with the best weights at ``free`` for a ``scale``."""
         smoothing = scale * self.linear.differences
         least, (_, errors) = self.linear.least, self._linearised(free)
-        rows = np.concatenate([self.effects, smoothing])
-        right = np.append(self.effects @ self.above - errors, -smoothing @ least)
-        above = nonnegative(rows, right)
+        wanted = self.factor @ self.above - self.basis.T @ errors
+        above = nonnegative(
+            np.concatenate([self.factor, smoothing]),
+            np.append(wanted, -smoothing @ least),
+        )
         weights = np.array(get(self.problem.system, self.linear.path))
         weights[self.linear.places] = least + above
         problem = _replaced(self.problem, self.linear.path, as_array(weights))
+        active = np.concatenate([self.factor, smoothing])[:, above > 0.0]
         return self._replace(
-            problem=problem, smoothing=smoothing, above=above, scale=scale
+            problem=problem,
+            above=above,
+            smoothing=smoothing,
+            scale=scale,
+            inverse=np.linalg.pinv(active.T @ active, hermitian=True),
+        )
+
+    def likeliest_scale(self, free: Float[Array, " n"]) -> float:
+        """Return the likeliest scale of the prior.
+
+        The errors must be those under a light prior: a heavy one adds to them, and they
+        would make it heavier.
+        """
+        rms, independent = self.problem.spread(squash(free))
+        _, errors = self._linearised(free)
+        seen = self.basis.T @ errors
+        # One more row stands for all that no weight changes.
+        unseen = np.sqrt(max(0.0, errors @ errors - seen @ seen))
+        return likeliest_scale(
+            np.append(self.factor, np.zeros((1, self.above.size)), axis=0),
+            self.linear.differences,
+            np.append(self.factor @ (self.linear.least + self.above) - seen, unseen),
+            rms / np.sqrt(independent) * SCALES,
+            independent,
         )
 
     def _linearised(self, free: Array) -> tuple[np.ndarray, np.ndarray]:
         found = _linearised(self.problem, free, _every(self.problem))
         slopes, errors = map(np.asarray, found)
         return slopes, errors
+
+
+def likeliest_scale(
+    effects: Float[np.ndarray, "rows k"],
+    differences: Float[np.ndarray, "pairs k"],
+    wanted: Float[np.ndarray, " rows"],
+    scales: Float[np.ndarray, " scales"],
+    independent: float,
+) -> float:
+    """Return the one of ``scales`` with the largest marginal likelihood.
+
+    The best weights minimise the sum of the squares of ``effects @ weights - wanted``
+    and of ``scale * differences @ weights``. Errors and differences are normal with
+    unknown variances, and ``independent`` errors tell as much as all rows; bounds are
+    ignored (MacKay, Neural Computation 4, 1992, 415-447).
+    """
+    import scipy.linalg  # takes long to import
+
+    # In this basis the squares of differences and effects are both diagonal.
+    heaviest = float(np.max(scales)) ** 2
+    rough = differences.T @ differences
+    rank = np.linalg.matrix_rank(rough, hermitian=True)
+    both = effects.T @ effects + heaviest * rough
+    both += np.finfo(float).eps * np.trace(both) * np.eye(len(both))
+    share, basis = scipy.linalg.eigh(rough, both)
+    share = np.clip(share, 0.0, 1.0 / heaviest)
+    curvature = 1.0 - share * (heaviest - scales[:, None] ** 2)
+    slope = basis.T @ (effects.T @ wanted)
+    left = wanted @ wanted - np.sum(slope**2 / curvature, axis=1)
+    unlikely = (
+        independent * np.log(left)
+        - 2.0 * rank * np.log(scales)
+        + np.sum(np.log(curvature), axis=1)
+    )
+    return float(scales[np.argmin(unlikely)])
 
 
 def nonnegative(
@@ -105,31 +176,20 @@ def nonnegative(
 
 
 def with_weights(
-    problem: Problem,
-    linear: LinearWeights,
-    free: Float[Array, " n"],
-    scale: float = np.inf,
+    problem: Problem, linear: LinearWeights, free: Float[Array, " n"]
 ) -> WeightsFit:
     """Return ``problem`` with the weights that fit best at ``free``.
 
     The errors do not determine each weight. Neighbours are alike: their differences
-    have a normal prior, whose scale against the errors is that of one independent
-    sample of these, and at most ``scale``: a prior that is too heavy raises the errors,
-    and these must not make it heavier.
+    have a normal prior, with the likeliest scale against the errors.
     """
-    every, count = _every(problem), len(linear.least)
-    first = np.array(get(problem.system, linear.path))
-    changes = np.zeros((count, *first.shape))
-    changes[np.arange(count), *linear.places] = 1.0
-    effects = in_batches(
-        lambda some: _effects(problem, linear.path, free, some, every), changes, WIDTH
-    ).T
-    above = first[linear.places] - linear.least
-    fit = WeightsFit(problem, linear, effects, linear.differences, above, scale)
-    for _ in range(ROUNDS):
-        rms, independent = fit.problem.spread(squash(free))
-        fit = fit.best_at(free, min(fit.scale, rms / np.sqrt(independent)))
-    return fit
+    effects = np.asarray(_effects(problem, linear, free, _every(problem))).T
+    basis, factor = np.linalg.qr(effects)
+    above = np.array(get(problem.system, linear.path))[linear.places] - linear.least
+    rms, independent = problem.spread(squash(free))
+    first = WeightsFit(problem, linear, basis, factor, above)
+    light = first.best_at(free, LIGHT * rms / np.sqrt(independent))
+    return light.best_at(free, light.likeliest_scale(free))
 
 
 def _every(problem: Problem) -> int:
@@ -142,16 +202,36 @@ def _replaced(problem: Problem, path: str, weights: Any) -> Problem:
 
 
 @eqx.filter_jit
-def _effects(
-    problem: Problem, path: str, free: Array, changes: Array, every: int
-) -> Array:
-    """Return the change [changes, rows] of the residuals for each of ``changes``."""
+def _effects(problem: Problem, linear: LinearWeights, free: Array, every: int) -> Array:
+    """Return the change [k, rows] of the residuals by each weight."""
+    unit = squash(free)
+    system = problem.space.put(problem.system, unit)
+    assert isinstance(system, Series)
+    assert problem.starts is not None
+    at = system.names.index(linear.path.rpartition(".")[0])
+    first, own, last = system.parts[:at], system.parts[at], system.parts[at + 1 :]
 
-    def residuals(weights: Array) -> Array:
-        return _replaced(problem, path, weights).residuals(squash(free), every)
+    def moved(input: Array, start: Start) -> Array:
+        path = path_after(input, start.levels)
+        return run_outputs(Series(first), path, Series(first).init(path[0]))
 
-    weights = get(problem.system, path)
-    return jax.vmap(lambda d: jax.jvp(residuals, (weights,), (d,))[1])(changes)
+    def behind(motion: Array) -> Array:
+        return recorded(run_outputs(Series(last), motion, Series(last).init(motion[0])))
+
+    motions = jax.vmap(moved)(problem.inputs, problem.starts)
+    # The parts behind are linear, with an offset.
+    passed = jax.linearize(behind, jnp.zeros_like(motions[0]))[1]
+    effect = problem.effect_of(unit, every)
+
+    def some(places: list[Array]) -> Array:
+        added = jax.vmap(lambda motion: linear.responses(own, motion, places))(motions)
+        return jax.vmap(lambda each: effect(jax.vmap(passed)(each)), 1)(added)
+
+    count = len(linear.least)
+    batches = np.minimum(np.arange(-(-count // WIDTH) * WIDTH), count - 1)
+    batches = batches.reshape(-1, WIDTH)
+    found = jax.lax.map(some, [axis[batches] for axis in linear.places])
+    return found.reshape(-1, found.shape[-1])[:count]
 
 
 @eqx.filter_jit

@@ -194,8 +194,7 @@ def output_error(
     rough = min(steps, ROUGH_STEPS) if whitened or several else steps
     units, losses, finished = _inside(starts), np.zeros(len(starts)), False
     parts = [settled_part(record.input, train) for record in records]
-    whole, settled = problem.weights, not several
-    weights = begun and begun.weights
+    whole, settled, weights = problem.weights, not several, None
     alone = cautious or structure.linear is not None
 
     def searched(problem: Problem, unit: np.ndarray) -> Problem:
@@ -226,7 +225,7 @@ def output_error(
         last, past = settled or turn == passes - 1, losses[0]
         limit = steps if last and not whitened else rough
         problem, units, losses, finished, weights = _descended(
-            problem, structure.linear, weights, _inside(units), width, limit, progress
+            problem, structure.linear, _inside(units), width, limit, progress
         )
         if last:
             break
@@ -251,7 +250,7 @@ def output_error(
             # The best point first: linear weights are fitted there.
             units = np.concatenate([units[:1], again])
         problem, units, losses, finished, weights = _descended(
-            problem, structure.linear, weights, _inside(units), width, steps, progress
+            problem, structure.linear, _inside(units), width, steps, progress
         )
         if turn == rounds - 1:
             break
@@ -300,7 +299,6 @@ def _inside(units: np.ndarray) -> np.ndarray:
 def _descended(
     problem: Problem,
     linear: LinearWeights | None,
-    before: WeightsFit | None,
     starts: np.ndarray,
     width: int,
     steps: int,
@@ -308,13 +306,11 @@ def _descended(
 ) -> Optimum:
     """Return the optimum from ``starts``, that of the ``linear`` weights included.
 
-    ``before`` is an earlier fit of these weights. ``width`` starts descend together,
-    and at most as many points are returned. Raises ValueError if no start leads to a
-    finite simulation.
+    ``width`` starts descend together, and at most as many points are returned. Raises
+    ValueError if no start leads to a finite simulation.
     """
     firsts = np.asarray(unsquash(as_array(starts)))
-    scale = before.scale if before else np.inf
-    weights = linear and with_weights(problem, linear, as_array(firsts[0]), scale)
+    weights = linear and with_weights(problem, linear, as_array(firsts[0]))
     equations = partial(_normal_equations, problem)
     evaluate = trials_with_models(
         weights.normal_equations if weights else equations, width

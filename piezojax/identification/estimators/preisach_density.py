@@ -1,21 +1,15 @@
 """Fit of Preisach densities to a record by non-negative least squares."""
 
-from typing import Any
-
-import jax
-import jax.numpy as jnp
+import equinox as eqx
 import numpy as np
 import scipy
+from jaxtyping import Array
 
-from ...core.arrays import State, as_array
-from ...core.rollout import simulate
-from ...core.system import System
+from ...core.arrays import as_array
 from ...dynamics import ARMA
 from ...hysteresis import Preisach, RateDependentPreisach
 from ...hysteresis.preisach import (
     LEAST_SLOPE,
-    Levels,
-    PlayLines,
     line_by_line,
     neighbours,
 )
@@ -154,23 +148,9 @@ def _slow(shape: Preisach | RateDependentPreisach) -> Preisach:
     return shape.slow if isinstance(shape, RateDependentPreisach) else shape
 
 
-class _Memory(System):
-    """Memory of a Preisach model; its output is the levels."""
-
-    lines: PlayLines
-
-    def init(self, input: Any = 0.0) -> State:
-        return self.lines.init(input)
-
-    def step(self, state: Levels, input: Any) -> tuple[State, Any]:
-        state = self.lines.advance(state, input)
-        return state, state
-
-
-@jax.jit
-def _levels(shape: Preisach, input: Any) -> Any:
-    memory = _Memory(shape.resolved())
-    return simulate(memory, input, memory.init(input[0]))[1]
+@eqx.filter_jit
+def _responses(shape: Preisach, input: Array, places: tuple[Array, ...]) -> Array:
+    return shape.responses(input, places)
 
 
 def responses(
@@ -185,13 +165,8 @@ def responses(
     of the slow one.
     """
     slow = _slow(shape)
-    levels = np.asarray(_levels(slow, jnp.asarray(input)))
-    up = np.hstack(
-        [
-            np.clip(levels[:, [k]] - np.arange(slow.cells - k), 0.0, 1.0)
-            for k in range(slow.cells)
-        ]
-    )
+    places = tuple(np.transpose(line_by_line(slow.cells)))
+    up = np.asarray(_responses(slow, as_array(input), places)).T
     if isinstance(shape, RateDependentPreisach):
         rate = np.diff(input, prepend=input[0]) / shape.dt
         fast = np.asarray(fast_share(as_array(rate) / shape.rate))[:, None]
