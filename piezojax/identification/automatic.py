@@ -34,7 +34,7 @@ FROM_SEVERAL = (*HYSTERESES[:2], "dahl_frictions")
 
 DENSITY = "preisach"
 """Model of several records if its error is clearly smaller than that of the best other
-one: a density describes many loops, and its fit takes minutes."""
+one: a density describes many loops."""
 
 EVERY = (*FROM_SEVERAL, DENSITY)
 """All models that are fitted to several records."""
@@ -182,10 +182,19 @@ def _for_several(
         """Return the rms error of a fit, infinite if it failed.
 
         It includes the deviations from the prior, so that a model does not win by
-        parameters that the records do not determine.
+        parameters that the records do not determine. Weights that they determine make
+        it larger, as in generalised cross-validation (Craven and Wahba, Numerische
+        Mathematik 31, 1979, 377-403).
         """
         found = fits[name]
-        return np.inf if found is None else float(np.sqrt(found.losses[0]))
+        if found is None:
+            return np.inf
+        rms = float(np.sqrt(found.losses[0]))
+        if found.weights is None:
+            return rms
+        _, independent = found.problem.spread(as_array(found.units[0]))
+        left = 1.0 - found.weights.freedom / independent
+        return rms / left if left > 0.0 else np.inf
 
     begun, limit = {}, CLOSE * min(map(error, EVERY))
     if shown is not None:

@@ -1,5 +1,7 @@
 """Trials that choose the hysteresis of a default model: their records and rates."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -82,6 +84,30 @@ def test_a_hysteresis_of_more_parameters_must_be_clearly_better(
 
     monkeypatch.setattr(automatic, "seen_again", seen_again)
     monkeypatch.setattr(automatic, "output_error", fitting(lambda name: known[name]))
+    monkeypatch.setattr(automatic, "structure", named)
+    assert automatic.hysteresis_for(several()).model == best
+
+
+@pytest.mark.parametrize(("freedom", "best"), [(10.0, DENSITY), (50.0, CURVE)])
+def test_weights_that_records_determine_count_against_a_density(
+    freedom, best, monkeypatch
+):
+    """Of a hundred independent errors, as many as weights say nothing."""
+    others = fitting(lambda _: 10.0)
+    weights = SimpleNamespace(freedom=freedom)
+    problem = SimpleNamespace(spread=lambda _: (5.0, 100.0))
+
+    def output_error(shape, *_, **__):
+        found = others(shape)
+        if shape.system != DENSITY:
+            return found
+        return Optimum(problem, np.zeros((1, 0)), np.array([25.0]), True, weights)
+
+    def seen_again(*_, **__):
+        raise ValueError("plays do not fit")
+
+    monkeypatch.setattr(automatic, "seen_again", seen_again)
+    monkeypatch.setattr(automatic, "output_error", output_error)
     monkeypatch.setattr(automatic, "structure", named)
     assert automatic.hysteresis_for(several()).model == best
 

@@ -195,6 +195,16 @@ def test_best_weights_leave_no_better_ones_nearby(problem):
     assert loss[0] == pytest.approx(0.5 * (errors @ errors + rough @ rough))
 
 
+def test_only_weights_that_the_errors_determine_count(problem):
+    shape, known = problem
+    at = free(shape)
+    fit = with_weights(known, shape.linear, at)
+    # Under a heavy prior the diagonal is constant, and so is the rest.
+    assert fit.best_at(at, 1e3).freedom == pytest.approx(2.0, abs=0.01)
+    light = fit.best_at(at, 1e-3 * fit.scale)
+    assert 2.0 < fit.freedom < light.freedom <= np.count_nonzero(light.above)
+
+
 @pytest.mark.parametrize("rough", [0.1, 3.0])
 def test_the_likeliest_prior_is_the_one_that_the_weights_were_drawn_from(rough):
     random = np.random.default_rng(11)

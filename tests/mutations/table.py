@@ -528,6 +528,13 @@ MUTATIONS = (
         ("tests/identification/test_automatic.py",),
     ),
     Mutation(
+        "a density whose many weights count for nothing in the choice",
+        "identification/automatic.py",
+        "left = 1.0 - found.weights.freedom / independent",
+        "left = 1.0",
+        ("tests/identification/test_automatic.py",),
+    ),
+    Mutation(
         "weights that are fitted at a poor guess of the dynamics",
         "identification/estimators/output_error.py",
         "units = np.concatenate([units[:1], again])",

@@ -51,6 +51,12 @@ class WeightsFit(NamedTuple):
     scale: float = np.inf
     inverse: np.ndarray = np.zeros((0, 0))
 
+    @property
+    def freedom(self) -> float:
+        """Number of weights that the errors determine, not the prior or the bounds."""
+        factor = self.factor[:, self.above > 0.0]
+        return float(np.sum(self.inverse * (factor.T @ factor)))
+
     def normal_equations(
         self, points: Float[Array, "points n"]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
