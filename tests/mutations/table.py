@@ -559,7 +559,7 @@ MUTATIONS = (
     Mutation(
         "standard errors that take fitted weights for known ones",
         "identification/estimators/linear_weights.py",
-        "slopes.T @ slopes - crossed.T @ inverse @ crossed,",
+        "slopes.T @ slopes - crossed.T @ self.inverse @ crossed,",
         "slopes.T @ slopes,",
         ("tests/identification/test_linear_weights.py",),
     ),
