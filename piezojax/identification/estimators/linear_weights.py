@@ -92,14 +92,12 @@ class WeightsFit(NamedTuple):
         smoothing = scale * self.linear.differences
         least, (_, errors) = self.linear.least, self._linearised(free)
         wanted = self.factor @ self.above - self.basis.T @ errors
-        above = nonnegative(
-            np.concatenate([self.factor, smoothing]),
-            np.append(wanted, -smoothing @ least),
-        )
+        rows = np.concatenate([self.factor, smoothing])
+        above = nonnegative(rows, np.append(wanted, -smoothing @ least))
         weights = np.array(get(self.problem.system, self.linear.path))
         weights[self.linear.places] = least + above
         problem = _replaced(self.problem, self.linear.path, as_array(weights))
-        active = np.concatenate([self.factor, smoothing])[:, above > 0.0]
+        active = rows[:, above > 0.0]
         return self._replace(
             problem=problem,
             above=above,
