@@ -16,13 +16,24 @@ RAMP = 2.0
 """The same, if the delay may contain the ramp of a step at an unknown slew rate."""
 
 
+ORDERS = 1, 3
+"""Orders of the polynomials between samples."""
+
+
 class FractionalDelay(Fittable):
-    """``y(t) = x(t - delay)``, interpolated linearly between samples.
+    """``y(t) = x(t - delay)``, interpolated between samples.
 
     ``delay`` lies between 0 and ``longest`` (1 to 64) samples; y has the unit of x. The
-    output is differentiable with respect to the delay, through the weights of the two
-    adjacent samples. For a whole number of samples it equals Delay. Raises ValueError
-    for a delay outside 0 to longest * dt.
+    output is differentiable with respect to the delay, through the weights of the
+    adjacent samples. For a whole number of samples it equals Delay.
+
+    ``order`` is that of the polynomial through the adjacent samples (Lagrange's, as in
+    Laakso et al., IEEE Signal Processing Magazine 13(1), 1996, 30-60). Order 1 stays
+    between two samples, as a delayed voltage must, and attenuates fast motions: one at
+    a tenth of the sampling rate by up to 5 %. Order 3 changes it by at most 0.6 % and
+    suits a displacement; after a jump it overshoots.
+
+    Raises ValueError for a delay outside 0 to longest * dt and for another order.
     """
 
     part: ClassVar[Part] = Part("delay", "delay", "Delay of up to five samples")
@@ -32,9 +43,20 @@ class FractionalDelay(Fittable):
     longest: int = parameter(
         "samples", "longest delay", least=1.0, most=64.0, whole=True, static=True
     )
+    order: int = parameter(
+        "1",
+        "order between samples",
+        least=1.0,
+        most=3.0,
+        whole=True,
+        static=True,
+        default=1,
+    )
 
     def __check_init__(self):
         check("delay in s", self.delay, most=self.longest * self.dt)
+        if self.order not in ORDERS:
+            raise ValueError(f"order is {self.order!r}; it must be one of {ORDERS}")
 
     @classmethod
     def recipe(cls, extent: Extent) -> Recipe:
@@ -51,21 +73,34 @@ class FractionalDelay(Fittable):
                 off += LAG_DOUBT * sum(extent.lags)
             bounds = Range(max(0.0, starts[0] - off), min(starts[0] + off, 5.0 * dt))
         return Recipe(
-            cls(0.5 * dt, dt, 5),
+            cls(0.5 * dt, dt, 5, order=3),
             {"delay": bounds},
             [{"delay": delay} for delay in starts],
         )
 
     def init(self, input: ScalarLike = 0.0) -> tuple[Scalar, ...]:
-        return (as_array(input),) * self.longest
+        samples = self.longest if self.order == 1 else max(self.longest + 1, 3)
+        return (as_array(input),) * samples
 
     def step(
         self, state: tuple[Scalar, ...], input: ScalarLike
     ) -> tuple[tuple[Scalar, ...], Scalar]:
-        input = as_array(input)
-        samples = self.delay / self.dt
-        output = jnp.zeros_like(input)
-        for age, value in enumerate((input, *state)):
-            weight = jnp.maximum(1.0 - jnp.abs(samples - age), 0.0)
-            output = output + weight * value
-        return (input, *state[:-1]), output
+        values, first = (as_array(input), *state), 0
+        if self.order == 3:
+            # A delay below one sample takes the cubic through the four last values.
+            ahead = 4.0 * (values[0] + values[2]) - 6.0 * values[1] - values[3]
+            values, first = (ahead, *values), -1
+        output = jnp.zeros_like(values[0])
+        for age, value in enumerate(values, first):
+            apart = jnp.abs(self.delay / self.dt - age)
+            output = output + _lagrange(apart, self.order) * value
+        return (as_array(input), *state[:-1]), output
+
+
+def _lagrange(apart: Scalar, order: int) -> Scalar:
+    """Return the weight of a sample that lies ``apart`` samples from the delay."""
+    near = jnp.maximum(1.0 - apart, 0.0)
+    if order == 1:
+        return near
+    far = jnp.where(apart < 2.0, (1.0 - apart) * (3.0 - apart) / 3.0, 0.0)
+    return 0.5 * (2.0 - apart) * jnp.where(apart < 1.0, near * (1.0 + apart), far)

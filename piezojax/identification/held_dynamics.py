@@ -68,7 +68,7 @@ class HeldDynamics:
         if isinstance(part, FractionalDelay):
             delay = float(part.delay)
         if delay is not None:
-            return FractionalDelay(delay, dt, max(1, math.ceil(delay / dt)))
+            return FractionalDelay(delay, dt, max(1, math.ceil(delay / dt)), order=3)
         if isinstance(part, CONTINUOUS):
             return dataclasses.replace(part, dt=dt)
         raise ValueError(

@@ -151,7 +151,7 @@ def _with_delay(system: System, dt: float) -> System:
     if DELAY not in names:
         place = len(parts) - isinstance(parts[-1], Affine)
         names.insert(place, DELAY)
-        parts.insert(place, FractionalDelay(0.0, dt, MORE))
+        parts.insert(place, FractionalDelay(0.0, dt, MORE, order=3))
     place = names.index(DELAY)
     delay = parts[place]
     if isinstance(delay, FractionalDelay):

@@ -166,7 +166,8 @@ def _system_of(fit: ModalFit, dt: float) -> System:
         if whole:
             parts["whole_delay"] = Delay(whole)
         rest = delay - whole * dt
-        parts["delay"] = FractionalDelay(rest, dt, max(1, math.ceil(rest / dt)))
+        longest = max(1, math.ceil(rest / dt))
+        parts["delay"] = FractionalDelay(rest, dt, longest, order=3)
     return series(**parts)
 
 

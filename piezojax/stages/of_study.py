@@ -105,5 +105,5 @@ def _plant(case: Case, file: str | Path | None, gain: float, delay: float) -> Sy
         found = found >> Affine(gain)
     if delay:
         dt = case.study.dt
-        found = found >> FractionalDelay(delay * dt, dt, LONGEST_DELAY)
+        found = found >> FractionalDelay(delay * dt, dt, LONGEST_DELAY, order=3)
     return found

@@ -1,6 +1,11 @@
+import math
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.test_util import check_grads
+from scipy.interpolate import BarycentricInterpolator
 
 from piezojax import (
     simulate,
@@ -27,6 +32,41 @@ def test_a_delay_interpolates_between_samples(samples):
     np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
+@pytest.mark.parametrize("samples", [0.0, 0.4, 1.0, 1.3, 2.7, 4.0])
+def test_order_3_takes_the_cubic_through_the_adjacent_samples(samples):
+    values = np.r_[np.full(10, 0.5), INPUT]
+    # No sample is newer than the last one: its cubic serves for the first interval.
+    newest = np.arange(10, 50) - max(0, math.floor(samples) - 1)
+    expected = []
+    for last, at in zip(newest, np.arange(10, 50) - samples, strict=True):
+        taken = np.arange(last - 3, last + 1)
+        expected.append(BarycentricInterpolator(taken, values[taken])(at))
+    found = response(FractionalDelay(samples * DT, DT, 4, order=3), INPUT, 0.5)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("samples", [0.3, 0.5, 1.5, 3.25])
+def test_order_3_hardly_changes_a_vibration_at_a_tenth_of_the_sampling_rate(samples):
+    angle = 0.2 * np.pi * np.arange(400)
+    expected = np.sin(angle - 0.2 * np.pi * samples)
+    linear, cubic = (
+        np.max(np.abs(response(part, np.sin(angle), 0.0) - expected)[10:])
+        for part in (
+            FractionalDelay(samples * DT, DT, 4, order=order) for order in (1, 3)
+        )
+    )
+    assert cubic < 7e-3 < 3e-2 < linear
+
+
+def test_order_3_has_the_derivative_of_its_delay():
+    def moved(delay):
+        part = FractionalDelay(delay, DT, 4, order=3)
+        return jnp.sum(response(part, INPUT, 0.5) ** 2)
+
+    for samples in (0.4, 2.3):
+        check_grads(moved, (samples * DT,), order=1, eps=1e-8, rtol=1e-5)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -35,6 +75,8 @@ def test_a_delay_interpolates_between_samples(samples):
         ((0.0, 0.0, 4), "dt in s is 0"),
         ((0.0, DT, 0), "longest in samples is 0"),
         ((0.0, DT, 65), "longest in samples is 65; .* at most 64"),
+        ((0.0, DT, 4, 2), r"order is 2; it must be one of \(1, 3\)"),
+        ((0.0, DT, 4, 5), r"order is 5; it must be one of \(1, 3\)"),
     ],
 )
 def test_bad_parameters(arguments, message):
