@@ -156,7 +156,20 @@ def _optimum_warnings(
                 f"{name} is ambiguous: other values fit equally well, over "
                 f"{100.0 * spread[i]:.2g} % of its range"
             )
-    return found
+    return [*found, *weights_warning(optimum)]
+
+
+def weights_warning(optimum: Optimum) -> list[str]:
+    """Return a warning if the records do not determine all weights of a hysteresis."""
+    weights = optimum.weights
+    if weights is None or weights.freedom > weights.above.size - 0.5:
+        return []
+    return [
+        f"the records determine {weights.freedom:.0f} of the {weights.above.size} "
+        "weights of the hysteresis, the others follow from their neighbours: errors on "
+        "motions of another kind may be several times those of the fit. Validate the "
+        "model on another record"
+    ]
 
 
 def slew_warning(fitted: Mapping[str, FittedParameter], records: Records) -> list[str]:

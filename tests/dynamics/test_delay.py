@@ -6,14 +6,11 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 from scipy.interpolate import BarycentricInterpolator
+from scipy.signal import cont2discrete, lfilter
 
-from piezojax import (
-    simulate,
-)
+from piezojax import Record, identify, simulate
 from piezojax.core.recipe import Extent, Resonance
-from piezojax.dynamics import (
-    FractionalDelay,
-)
+from piezojax.dynamics import FractionalDelay
 
 DT = 1e-3
 INPUT = np.random.default_rng(0).normal(size=40)
@@ -96,3 +93,20 @@ def test_the_delay_of_several_records_may_change_as_much_as_the_lag_beside_it():
     )
     assert (one.lower, one.upper) == pytest.approx((1.375e-4, 1.625e-4))
     assert (several.lower, several.upper) == pytest.approx((0.475e-4, 2.5e-4))
+
+
+def test_a_fit_finds_a_mode_behind_a_delay_between_samples():
+    frequency, damping, delay, parts = 160.0, 0.02, 1.5, 4
+    u = np.repeat(np.random.default_rng(0).uniform(10.0, 90.0, 30), 30)
+    w = 2.0 * np.pi * frequency
+    mode = ([0.1 * w**2], [1.0, 2.0 * damping * w, w**2])
+    (b,), a, _ = cont2discrete(mode, DT / parts, "zoh")
+    late = np.r_[np.full(round(delay * parts), u[0]), np.repeat(u, parts)]
+    y = 0.1 * u[0] + lfilter(b, a, late - u[0])[: u.size * parts : parts]
+    fit = identify(Record(u, y, DT), "modes+delay")
+    found = {name: one.value for name, one in fit.report.parameters.items()}
+    # Straight lines between samples give a damping of 0.018.
+    assert found["dynamics.damping.0"] == pytest.approx(damping, rel=0.03)
+    assert found["calibration.gain"] == pytest.approx(0.1, rel=0.01)
+    assert found["dynamics.frequency.0"] == pytest.approx(frequency, rel=1e-3)
+    assert found["delay.delay"] == pytest.approx(delay * DT, rel=0.01)

@@ -1,6 +1,7 @@
 """Preisach weights in chains of any parts, against relays in a NumPy loop."""
 
 import itertools
+import re
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -24,6 +25,7 @@ from piezojax.identification.estimators.output_error import (
     output_error,
     values_and_errors,
 )
+from piezojax.identification.methods import weights_warning
 from piezojax.identification.records.record import Record
 
 # The programs run long: a density has hundreds of weights.
@@ -108,6 +110,10 @@ def test_two_records_determine_a_density_and_the_lag_behind_it(records):
     weights = np.asarray(found.system.parts[0].weights)
     assert (weights >= 0.0).all()
     assert not np.triu(weights, 1).any()
+    (warning,) = weights_warning(found)
+    known, count = map(int, re.findall(r"\d+", warning))
+    assert count == len(weights) * (len(weights) + 1) // 2
+    assert 10 < known < count // 2
     (lag,), (error,) = values_and_errors(found)
     assert lag == pytest.approx(LAG, rel=0.01)
     assert lag == pytest.approx(LAG, abs=5.0 * error)

@@ -507,6 +507,13 @@ MUTATIONS = (
         ("tests/identification/test_second_sight.py", "tests/dynamics/test_slew.py"),
     ),
     Mutation(
+        "a displacement that is delayed along straight lines",
+        "dynamics/delay.py",
+        "cls(0.5 * dt, dt, 5, order=3),",
+        "cls(0.5 * dt, dt, 5),",
+        ("tests/dynamics/test_delay.py",),
+    ),
+    Mutation(
         "a second look that starts at the defaults of its parts",
         "identification/second_sight.py",
         "nearest(replace(found, values))",
@@ -546,6 +553,13 @@ MUTATIONS = (
         "identification/estimators/linear_weights.py",
         "light.best_at(free, light.likeliest_scale(free))",
         "first.best_at(free, first.likeliest_scale(free))",
+        ("tests/identification/test_linear_weights.py",),
+    ),
+    Mutation(
+        "no word of weights that the records do not determine",
+        "identification/methods.py",
+        "weights.freedom > weights.above.size - 0.5",
+        "weights.freedom > 0.0",
         ("tests/identification/test_linear_weights.py",),
     ),
     Mutation(
