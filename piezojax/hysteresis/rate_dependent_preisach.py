@@ -8,7 +8,8 @@ from ..core.parameter import parameter, sample_time
 from ..core.system import Designed, System
 from .inverse import Inverse, InverseHysteresis
 from .model import Hysteresis
-from .preisach import Levels, PlayLines, Preisach, Rows, check_weights, outputs, rows_of
+from .play_lines import Levels, PlayLines, Rows, outputs, rows_of
+from .preisach import Preisach, check_weights
 
 
 class RateDependentPreisach(Hysteresis, Designed):

@@ -13,7 +13,8 @@ from ...core.space import Range, space_of
 from ...core.system import Series, series
 from ...dynamics import FirstOrderLag
 from ...hysteresis import Preisach, RateDependentPreisach
-from ...hysteresis.preisach import STARTS, line_by_line
+from ...hysteresis.play_lines import line_by_line
+from ...hysteresis.preisach import STARTS
 from ..records.record import Record
 from .estimate import bound_warning
 from .free_runs import from_rest

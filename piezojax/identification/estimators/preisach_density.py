@@ -8,11 +8,8 @@ from jaxtyping import Array
 from ...core.arrays import as_array
 from ...dynamics import ARMA
 from ...hysteresis import Preisach, RateDependentPreisach
-from ...hysteresis.preisach import (
-    LEAST_SLOPE,
-    line_by_line,
-    neighbours,
-)
+from ...hysteresis.play_lines import line_by_line
+from ...hysteresis.preisach import LEAST_SLOPE, neighbours
 from ...hysteresis.rate_dependent_preisach import fast_share
 from ..records.record import Record
 from .linear_weights import nonnegative
