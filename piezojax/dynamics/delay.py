@@ -8,6 +8,7 @@ from ..core.arrays import Scalar, ScalarLike, as_array, check
 from ..core.parameter import parameter, sample_time
 from ..core.recipe import LAG_DOUBT, Extent, Fittable, Part, Recipe
 from ..core.space import Range
+from ..core.system import Designed, System
 
 NEAR = 0.25
 """Largest change, in samples, that a fit makes to a delay estimated from the record."""
@@ -15,12 +16,11 @@ NEAR = 0.25
 RAMP = 2.0
 """The same, if the delay may contain the ramp of a step at an unknown slew rate."""
 
-
 ORDERS = 1, 3
 """Orders of the polynomials between samples."""
 
 
-class FractionalDelay(Fittable):
+class FractionalDelay(Fittable, Designed):
     """``y(t) = x(t - delay)``, interpolated between samples.
 
     ``delay`` lies between 0 and ``longest`` (1 to 64) samples; y has the unit of x. The
@@ -78,27 +78,41 @@ class FractionalDelay(Fittable):
             [{"delay": delay} for delay in starts],
         )
 
+    def resolved(self) -> "Taps":
+        """Return the System with the weights of the samples."""
+        samples = self.delay / self.dt
+        past = self.longest if self.order == 1 else max(self.longest + 1, 3)
+        weights = [_lagrange(samples - age, self.order) for age in range(past + 1)]
+        if self.order == 3:
+            # The cubic through the four last samples goes on to one that is to come.
+            ahead = _lagrange(samples + 1.0, self.order)
+            for age, factor in enumerate((4.0, -6.0, 4.0, -1.0)):
+                weights[age] = weights[age] + factor * ahead
+        return Taps(tuple(weights))
+
+
+class Taps(System):
+    """Weighted sum of the input and of those before it, the newest first.
+
+    The state holds the inputs before.
+    """
+
+    weights: tuple[Scalar, ...]
+
     def init(self, input: ScalarLike = 0.0) -> tuple[Scalar, ...]:
-        samples = self.longest if self.order == 1 else max(self.longest + 1, 3)
-        return (as_array(input),) * samples
+        return (as_array(input),) * (len(self.weights) - 1)
 
     def step(
         self, state: tuple[Scalar, ...], input: ScalarLike
     ) -> tuple[tuple[Scalar, ...], Scalar]:
-        values, first = (as_array(input), *state), 0
-        if self.order == 3:
-            # A delay below one sample takes the cubic through the four last values.
-            ahead = 4.0 * (values[0] + values[2]) - 6.0 * values[1] - values[3]
-            values, first = (ahead, *values), -1
-        output = jnp.zeros_like(values[0])
-        for age, value in enumerate(values, first):
-            apart = jnp.abs(self.delay / self.dt - age)
-            output = output + _lagrange(apart, self.order) * value
-        return (as_array(input), *state[:-1]), output
+        values = (as_array(input), *state)
+        terms = [w * value for w, value in zip(self.weights, values, strict=True)]
+        return values[:-1], sum(terms[1:], terms[0])
 
 
 def _lagrange(apart: Scalar, order: int) -> Scalar:
-    """Return the weight of a sample that lies ``apart`` samples from the delay."""
+    """Return the weight of a sample ``apart`` samples from the delay."""
+    apart = jnp.abs(apart)
     near = jnp.maximum(1.0 - apart, 0.0)
     if order == 1:
         return near
