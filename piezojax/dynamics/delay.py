@@ -4,11 +4,12 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 
-from ..core.arrays import Scalar, ScalarLike, as_array, check
+from ..core.arrays import Scalar, check
 from ..core.parameter import parameter, sample_time
 from ..core.recipe import LAG_DOUBT, Extent, Fittable, Part, Recipe
 from ..core.space import Range
-from ..core.system import Designed, System
+from ..core.system import Designed
+from .arma import ARMA
 
 NEAR = 0.25
 """Largest change, in samples, that a fit makes to a delay estimated from the record."""
@@ -78,8 +79,8 @@ class FractionalDelay(Fittable, Designed):
             [{"delay": delay} for delay in starts],
         )
 
-    def resolved(self) -> "Taps":
-        """Return the System with the weights of the samples."""
+    def resolved(self) -> ARMA:
+        """Return the moving average with the weights of the samples."""
         samples = self.delay / self.dt
         past = self.longest if self.order == 1 else max(self.longest + 1, 3)
         weights = [_lagrange(samples - age, self.order) for age in range(past + 1)]
@@ -88,26 +89,7 @@ class FractionalDelay(Fittable, Designed):
             ahead = _lagrange(samples + 1.0, self.order)
             for age, factor in enumerate((4.0, -6.0, 4.0, -1.0)):
                 weights[age] = weights[age] + factor * ahead
-        return Taps(tuple(weights))
-
-
-class Taps(System):
-    """Weighted sum of the input and of those before it, the newest first.
-
-    The state holds the inputs before.
-    """
-
-    weights: tuple[Scalar, ...]
-
-    def init(self, input: ScalarLike = 0.0) -> tuple[Scalar, ...]:
-        return (as_array(input),) * (len(self.weights) - 1)
-
-    def step(
-        self, state: tuple[Scalar, ...], input: ScalarLike
-    ) -> tuple[tuple[Scalar, ...], Scalar]:
-        values = (as_array(input), *state)
-        terms = [w * value for w, value in zip(self.weights, values, strict=True)]
-        return values[:-1], sum(terms[1:], terms[0])
+        return ARMA((), weights)
 
 
 def _lagrange(apart: Scalar, order: int) -> Scalar:
