@@ -78,10 +78,28 @@ def delayed(samples):
     return step
 
 
+def cubic(samples):
+    """Return four ages in samples, and their weights in the cubic at ``samples``."""
+    ages = np.arange(4.0) + max(0, int(samples) - 1)
+    return ages, np.linalg.solve(np.vander(ages).T, np.vander([samples], 4)[0])
+
+
+def delayed_by_cubics(samples):
+    """Return a delay that is cubic between samples, from rest at 0."""
+    past = [0.0] * 16
+    ages, weights = cubic(samples)
+
+    def step(value):
+        past.insert(0, value)
+        return sum(w * past[int(age)] for w, age in zip(weights, ages, strict=True))
+
+    return step
+
+
 def numpy_loop(reference, draws):
     """Return displacement and voltage with LINEAR and OTHER, in plain Python."""
     late, smooth = delayed(1.3 + 3e-5 / DT), filtered(2000.0, 2)
-    sensed, sensed_late = filtered(1200.0, 3), delayed(2e-5 / DT)
+    sensed, sensed_late = filtered(1200.0, 3), delayed_by_cubics(2e-5 / DT)
     against_aliasing = filtered(6e3, 1)
     most = 0.02 / 2e-6 * DT
     y = integral = slewed = 0.0
@@ -132,11 +150,15 @@ def written(angle):
         whole, share = int(samples), samples - int(samples)
         return (1.0 - share) * z**-whole + share * z ** -(whole + 1.0)
 
+    def delay_by_cubics(samples):
+        ages, weights = cubic(samples)
+        return sum(w * z**-age for w, age in zip(weights, ages, strict=True))
+
     pole = np.exp(-DT / TAU)
     plant = (1.0 - pole) / (z - pole)
     controller = INTEGRAL * DT * z / (z - 1.0)
     amplifier = low_pass(2000.0, 2) * delay(1.3 + 3e-5 / DT)
-    sensor = low_pass(1200.0, 3) * delay(2e-5 / DT) * low_pass(6e3, 1)
+    sensor = low_pass(1200.0, 3) * delay_by_cubics(2e-5 / DT) * low_pass(6e3, 1)
     return plant * controller * amplifier * sensor
 
 

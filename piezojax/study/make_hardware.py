@@ -52,7 +52,7 @@ def make_amplifier(study: Study) -> System | None:
     table = study.actuator
 
     def parts(axis: int) -> Parts:
-        return _response(study, "actuator", table, axis, table.computation)
+        return _response(study, "actuator", table, axis, 1, table.computation)
 
     given = any(parts(axis) for axis in range(study.axis_count))
     return _systems(study, parts) if given else None
@@ -80,7 +80,7 @@ def make_sensor(study: Study) -> System:
 
     def parts(axis: int) -> Parts:
         found: Parts = {}
-        response = _response(study, "sensor", table, axis)
+        response = _response(study, "sensor", table, axis, 3)
         if response:
             found["response"] = SensorResponse(series(**response))
         found["noise"] = Sensor(_of(table.noise_rms, axis))
@@ -127,9 +127,17 @@ def _converter(
 
 
 def _response(
-    study: Study, name: str, table: ElectronicsTable, axis: int, samples: float = 0.0
+    study: Study,
+    name: str,
+    table: ElectronicsTable,
+    axis: int,
+    order: int,
+    samples: float = 0.0,
 ) -> Parts:
-    """Return delay and low-pass, if given; ``samples`` are added to the delay."""
+    """Return delay and low-pass, if given; ``samples`` are added to the delay.
+
+    ``order`` is that of FractionalDelay: 1 for a voltage, 3 for a displacement.
+    """
     parts: Parts = {}
     delay = samples + _of(table.delay, axis) / study.dt
     if delay > LONGEST:
@@ -140,7 +148,9 @@ def _response(
     if delay > 0.0:
         # An ensemble may draw a delay of up to twice the nominal one.
         longest = min(LONGEST, 2 * math.ceil(delay))
-        parts["delay"] = FractionalDelay(delay * study.dt, study.dt, longest)
+        parts["delay"] = FractionalDelay(
+            delay * study.dt, study.dt, longest, order=order
+        )
     bandwidth = _of(table.bandwidth, axis)
     if bandwidth is not None:
         parts["low_pass"] = AnalogLowPass(bandwidth, study.dt, table.order or 1)
