@@ -19,7 +19,7 @@ from .automatic import automatic
 from .chain import DEFAULT, by_evidence, shown_dynamics
 from .closed_loop import check_approach, feedback_warnings, is_closed
 from .estimators.estimate import FittedParameter, LinearDetail, Options
-from .estimators.projection import excited_columns
+from .estimators.projection import motion
 from .estimators.resonances import LinearDynamics
 from .held_dynamics import HeldDynamics, combined_bound
 from .known_plant import KnownPlant
@@ -394,36 +394,34 @@ def _fit_error(
 def _error_warnings(
     records: Sequence[Record], runs: Sequence[np.ndarray], part: slice
 ) -> list[str]:
-    errors, outputs = (
-        np.concatenate([_to_explain(record, each, part) for record, each in pairs])
-        for pairs in (
-            [(r, run - r.outputs) for r, run in zip(records, runs, strict=True)],
-            [(r, r.outputs) for r in records],
-        )
+    errors = np.concatenate(
+        [
+            # In a closed loop drift is no error of the model.
+            motion(r, run - r.outputs, part)
+            if r.excitation.size
+            else (run - r.outputs)[part]
+            for r, run in zip(records, runs, strict=True)
+        ]
     )
-    share = unexplained_share(errors, outputs)
-    if share <= POOR:
-        return []
+    outputs = np.concatenate([motion(r, r.outputs, part) for r in records])
+    shares = unexplained_shares(errors, outputs)
     return [
-        f"the model explains little: its validation error is {100.0 * share:.0f} % of "
-        "the output's own deviation"
+        f"the model explains little{of_output(i, shares.size)}: its validation error "
+        f"is {100.0 * share:.0f} % of the output's own deviation"
+        for i, share in enumerate(shares)
+        if share > POOR
     ]
 
 
-def _to_explain(record: Record, columns: np.ndarray, part: slice) -> np.ndarray:
-    """Return the motion in ``part`` of ``columns`` [samples, p] that a model explains.
+def unexplained_shares(errors: np.ndarray, outputs: np.ndarray) -> np.ndarray:
+    """Return the rms of each of ``errors`` over the deviation of its output, [p].
 
-    In a closed loop it is the response to the excitation without its mean: noise and
-    drift are left out.
+    Both are [samples, p]; one output may move less than another, or in another unit.
     """
-    if not record.excitation.size:
-        return columns[part]
-    found = excited_columns(record, columns)[part]
-    # A record that ends before the part has no samples in it.
-    return found - found.mean(axis=0) if len(found) else found
+    deviations = np.std(outputs, axis=0)
+    return np.sqrt(np.mean(errors**2, axis=0)) / np.maximum(deviations, 1e-30)
 
 
-def unexplained_share(errors: np.ndarray, outputs: np.ndarray) -> float:
-    """Return the rms of ``errors`` over the deviation of ``outputs``, [samples, p]."""
-    deviation = np.sqrt(np.mean(np.var(outputs, axis=0)))
-    return float(np.sqrt(np.mean(errors**2)) / max(deviation, 1e-30))
+def of_output(output: int, outputs: int) -> str:
+    """Return the words that name one of several outputs; none for the only one."""
+    return f" of output {output}" if outputs > 1 else ""

@@ -16,7 +16,7 @@ from ..core.system import System, accepts, rest_output
 from .estimators.free_runs import first_covering
 from .estimators.projection import excited_columns
 from .estimators.start_search import start_of
-from .fit import POOR, unexplained_share
+from .fit import POOR, of_output, unexplained_shares
 from .records.record import LARGEST, Record
 from .residuals.bound import joined
 from .residuals.report import model_faults
@@ -236,14 +236,17 @@ def _judged(
         text = "the model diverges on this record: choose another model"
         return _Judged(check, run, None, [text], [])
     faults = model_faults([record], [run], rest)
-    share = unexplained_share(
+    shares = unexplained_shares(
         *(
             excited_columns(record, each)[rest]
             for each in (run - record.outputs, record.outputs)
         )
     )
+    known = about.residual_rms if len(about.residual_rms) == len(each) else [0.0]
+    fitted = np.array(known)
+    times = np.where(fitted > 0.0, each / np.where(fitted > 0.0, fitted, 1.0), np.nan)
     alarms = [
-        *_error_alarms(check, about, share),
+        *_error_alarms(shares, times, about),
         *faults.alarms,
         *faults.warnings,
     ]
@@ -344,21 +347,24 @@ def _by_input(record: Record, error: np.ndarray, part: slice) -> list[PartError]
     return found
 
 
-def _error_alarms(check: RecordCheck, about: About, share: float) -> Iterator[str]:
-    """Yield an alarm if the error is large relative to the motion and that of the fit.
+def _error_alarms(shares: np.ndarray, times: np.ndarray, about: About) -> Iterator[str]:
+    """Yield an alarm for each output whose error is large.
 
-    On a record of small motions an error as small as that of the fit raises no alarm.
+    ``shares`` are the errors relative to the motions, ``times`` relative to those of
+    the fit, NaN if these are not known. On a record of small motions an error as small
+    as that of the fit raises no alarm.
     """
-    times = check.times_fit
-    if share <= POOR or (times is not None and times <= WORSE):
-        return
-    compared = "" if times is None else f" and {times:.3g} times that of the fit"
-    yield (
-        f"the model does not hold on this record: its error is {100.0 * share:.0f} % "
-        f"of the motion{compared}; it is a model of another stage "
-        f"({about.record or 'its record is unknown'}), or stage, sensor or columns "
-        "have changed: fit a model to this record"
-    )
+    for output, (share, ratio) in enumerate(zip(shares, times, strict=True)):
+        if share <= POOR or ratio <= WORSE:
+            continue
+        compared = "" if np.isnan(ratio) else f" and {ratio:.3g} times that of the fit"
+        yield (
+            "the model does not hold on this record: its error"
+            f"{of_output(output, shares.size)} is {100.0 * share:.0f} % of the motion"
+            f"{compared}; it is a model of another stage "
+            f"({about.record or 'its record is unknown'}), or stage, sensor or columns "
+            "have changed: fit a model to this record"
+        )
 
 
 def _worse(check: RecordCheck) -> Iterator[str]:

@@ -316,3 +316,14 @@ def test_validation_on_training_samples_has_a_warning(clean):
     except ValueError:
         return
     assert any("validat" in text for text in fit.report.warnings)
+
+
+@pytest.mark.parametrize("zero", [0.0, 500.0])
+def test_the_zero_of_another_sensor_is_no_motion_to_explain(clean, zero):
+    """The stage moves three times as far in the validation part as in training."""
+    first = clean - clean[0]
+    first[900:] *= 3.0
+    records = [record_of(INPUT, first), record_of(INPUT, first + zero)]
+    report = identify(records, "lag", train=TRAIN, validate=slice(900, 1200)).report
+    assert any("the model explains little" in alarm for alarm in report.alarms)
+    assert any("2.9" in each and "times as far" in each for each in report.warnings)

@@ -309,6 +309,27 @@ def test_several_channels():
     assert "mA, the record of the model 0 to 1:" in note
 
 
+def test_an_output_in_another_unit_has_its_own_alarm():
+    """One output of 1 urad beside one of 100 um: pooled, its error would be nothing."""
+    u = jnp.asarray(excitation(3000)[:, None])
+    system = StateSpace(
+        np.diag([0.9, 0.9]), np.ones((2, 1)), np.diag([0.1, 1e-4]), np.zeros((2, 1)), DT
+    )
+    y = np.array(free_run(system, u, u[0]))
+    rotated = y * [1.0, -0.5]
+    about = About(record="old.csv", residual_rms=[1e-3, 1e-6])
+    u = np.asarray(u)
+    two = Record(u, rotated, DT, output_units=("um", "urad"), source="two.csv")
+    (alarm,) = (
+        text
+        for text in validate(system, about, two).report.alarms
+        if "does not hold" in text
+    )
+    assert re.search(r"its error of output 1 is \d+ % of the motion", alarm)
+    right = Record(u, y, DT, output_units=("um", "urad"), source="two.csv")
+    assert not validate(system, about, right).report.alarms
+
+
 @pytest.mark.parametrize(
     ("about", "changes", "estimate", "message"),
     [

@@ -87,6 +87,16 @@ def excited_columns(record: Record, columns: np.ndarray) -> np.ndarray:
     return np.stack(parts, axis=1)
 
 
+def motion(record: Record, columns: np.ndarray, part: slice) -> np.ndarray:
+    """Return the motion in ``part`` of ``columns`` [samples, p], without its mean.
+
+    In a closed loop it is the response to the excitation: noise and drift are left out.
+    A record that ends before the part has no samples in it.
+    """
+    found = excited_columns(record, columns)[part]
+    return found - found.mean(axis=0) if len(found) else found
+
+
 def excited_part(record: Record) -> Record:
     """Return ``record`` with the part of its signals that the excitation causes."""
     if not record.excitation.size:

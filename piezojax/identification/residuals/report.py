@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from ...core.error_bound import ErrorBound
-from ..estimators.projection import excited_columns
+from ..estimators.projection import motion
 from ..records.record import Record
 from .bound import RelativeError, error_bound, relative_error
 from .correlation import Correlation, autocorrelation, cross_correlation
@@ -188,19 +188,19 @@ def _wrong_from(found: RelativeError) -> float | None:
 def _gain_warnings(
     records: Sequence[Record], runs: Sequence[np.ndarray], validate: slice
 ) -> Iterator[str]:
-    for output in range(runs[0].shape[1]):
-        measured, modelled = (
-            np.concatenate(
-                [
-                    excited_columns(record, signal[:, [output]])[validate, 0]
-                    for record, signal in zip(records, signals, strict=True)
-                ]
-            )
-            for signals in ([record.outputs for record in records], runs)
+    # The sensor of each record has its own zero.
+    measured, modelled = (
+        np.concatenate(
+            [
+                motion(r, each, validate)
+                for r, each in zip(records, signals, strict=True)
+            ]
         )
-        moved = modelled - modelled.mean()
-        power = float(moved @ moved)
-        factor = float(moved @ (measured - measured.mean())) / max(power, 1e-300)
+        for signals in ([record.outputs for record in records], runs)
+    )
+    powers = np.sum(modelled**2, axis=0)
+    factors = np.sum(modelled * measured, axis=0) / np.maximum(powers, 1e-300)
+    for output, factor in enumerate(factors):
         if not 1.0 / OTHER_GAIN < factor < OTHER_GAIN:
             yield (
                 f"output {output} moves {factor:.3g} times as far as the model: "
