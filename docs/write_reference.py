@@ -292,7 +292,7 @@ these statuses:
 | 0 | finished; gains may be used |
 | 1 | refused or failed, with one line that says why |
 | 3 | finished with an alarm: the results are written and say why they are unsafe |
-| 130 | interrupted; tuning keeps the best gains |
+| 130, 143 | interrupted by Ctrl-C or SIGTERM; tuning keeps the best gains |
 """
 
 

@@ -114,7 +114,7 @@ def _check(case: Case, stage: Stage) -> None:
     if case.amplifier is not None:
         raise ValueError(
             "actuator: the plant of a study with an amplifier is not fitted again; "
-            "leave out its bandwidth, current and delay: they are in the runs"
+            "leave out its bandwidth, delay and computation: they are in the runs"
         )
     if not math.isclose(stage.dt, case.study.dt, rel_tol=1e-6):
         raise ValueError(
