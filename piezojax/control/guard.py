@@ -7,6 +7,7 @@ from jaxtyping import Array, Int
 
 from ..core.arrays import Scalar, State, as_array, check_order
 from ..core.feedback import Observation
+from ..core.limited import Limited
 from ..core.parameter import parameter, sample_time
 from ..core.system import System
 
@@ -44,7 +45,7 @@ class GuardState(NamedTuple):
     unseen: Scalar
 
 
-class Guard(System):
+class Guard(Limited):
     """A ``controller`` with a limited command, which retreats at the first fault.
 
     The command stays between ``lower`` and ``upper`` and changes by at most ``slew``.
@@ -87,6 +88,10 @@ class Guard(System):
         check_order("lower", self.lower, "upper", self.upper)
         check_order("lower", self.lower, "retreat", self.retreat, equal=True)
         check_order("retreat", self.retreat, "upper", self.upper, equal=True)
+
+    @property
+    def ends(self) -> tuple[Scalar, Scalar]:
+        return self.lower, self.upper
 
     def init(self, input: Observation) -> GuardState:
         none = jnp.zeros((), jnp.int32)

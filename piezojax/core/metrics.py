@@ -19,7 +19,7 @@ class TrackingFigures(NamedTuple):
     of the voltage in V, and ``rms_slew`` of the change of the voltage per sample in V.
     Two are over the whole run, because saturation during the start-up counts too:
     ``saturated``, the share of samples (0 to 1) at which the voltage differs from the
-    command, and ``peak_voltage`` in V.
+    command, or the controller itself limits the command, and ``peak_voltage`` in V.
     """
 
     rms_error: Scalar
@@ -35,8 +35,9 @@ class Tracking(Metric):
 
     ``start`` is the first sample of the window: the thesis excludes the start-up
     transient. A sample counts as saturated if the voltage differs from the command by
-    more than ``tolerance`` (V), so that the rounding of a converter does not count. If
-    a run ends before ``start``, the figures over the window are NaN.
+    more than ``tolerance`` (V), so that the rounding of a converter does not count, and
+    if the command is at a limit of the controller's own (``LoopSample``). If a run ends
+    before ``start``, the figures over the window are NaN.
     """
 
     start: int = eqx.field(static=True, default=0)
@@ -62,6 +63,8 @@ class Tracking(Metric):
         voltage = output.voltage
         change = jnp.where(index > self.start, voltage - total["last"], 0.0)
         clipped = jnp.abs(output.command - voltage) > self.tolerance
+        if output.at_limit is not None:
+            clipped = clipped | output.at_limit
         return {
             "samples": total["samples"] + 1.0,
             "count": total["count"] + inside,

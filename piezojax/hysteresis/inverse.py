@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from ..core.arrays import Scalar, ScalarLike, State, as_array, check_order
 from ..core.feedback import holding_input
+from ..core.limited import Limited
 from ..core.parameter import parameter
 from ..core.rollout import simulate
 from ..core.system import System
@@ -38,7 +39,7 @@ class Inverse(System):
         return self.model.step(state, voltage)[0], voltage
 
 
-class InverseHysteresis(Inverse):
+class InverseHysteresis(Inverse, Limited):
     """Numerical inverse of any monotone hysteresis, by Newton's method.
 
     Input in um, output in V, between ``lower`` and ``upper`` (V). If no voltage between
@@ -79,6 +80,10 @@ class InverseHysteresis(Inverse):
     def __check_init__(self):
         check_order("lower", self.lower, "upper", self.upper)
         check_rising(self.model, self.lower, self.upper)
+
+    @property
+    def ends(self) -> tuple[Scalar, Scalar]:
+        return self.lower, self.upper
 
     def init(self, input: ScalarLike = 0.0) -> State:
         return self.model.init(holding_input(self.model, input))

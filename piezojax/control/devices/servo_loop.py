@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from ...core.arrays import Scalar, State, as_array, check_option
 from ...core.feedback import Observation
+from ...core.limited import Limited
 from ...core.parameter import parameter, rounded_fields, sample_time
 from ...core.system import Affine, Designed, Series, System
 
@@ -64,7 +65,7 @@ class ServoLoopState(NamedTuple):
     velocity: Scalar
 
 
-class ServoLoop(System):
+class ServoLoop(Limited):
     """PID with filters of setpoint, measurement and output, feedforward, saturation.
 
     In a sample, with reference r and measurement z::
@@ -104,6 +105,10 @@ class ServoLoop(System):
     def __check_init__(self):
         check_option("integration", self.integration, INTEGRATIONS)
         check_option("anti_windup", self.anti_windup, ANTI_WINDUPS)
+
+    @property
+    def ends(self) -> tuple[Scalar, Scalar]:
+        return self.lower, self.upper
 
     def init(self, input: Observation) -> ServoLoopState:
         reference = as_array(input.reference)

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 
 from ...core.arrays import Scalar, ScalarLike, as_array, check_order
 from ...core.feedback import Observation
+from ...core.limited import Limited
 from ...core.parameter import parameter, sample_time
-from ...core.system import System
 from .servo_loop import Device
 
 PERIOD = 1.28e-6
@@ -104,7 +104,7 @@ class BiquadState(NamedTuple):
     outputs: tuple[Scalar, Scalar]
 
 
-class ClampedBiquad(System):
+class ClampedBiquad(Limited):
     """``y = clip(b0 x + b1 x1 + b2 x2 + a1 y1 + a2 y2 + u)``, in single precision.
 
     x is the measurement and u the offset of the set point, in codes of the converters;
@@ -120,6 +120,11 @@ class ClampedBiquad(System):
     lower: Scalar
     upper: Scalar
     dt: float = sample_time()
+
+    @property
+    def ends(self) -> tuple[Scalar, Scalar]:
+        ends = [self.offset + self.volts * end for end in (self.lower, self.upper)]
+        return jnp.minimum(*ends), jnp.maximum(*ends)
 
     def init(self, input: Observation) -> BiquadState:
         x = _single(self.codes * input.measured)
