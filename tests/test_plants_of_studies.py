@@ -234,7 +234,7 @@ def test_the_note_on_the_residual_has_the_unit_of_each_axis(case):
     assert "leaves 0.125 um, 2.5 urad rms of its record unexplained" in note
 
 
-def test_the_alarms_of_a_fit_are_those_of_its_study_only(case):
+def test_gains_carry_the_alarms_of_their_plant(case):
     about = case.plant_about.model_copy(
         update={"unsafe": ["the input is a time"], "error_bound": None}
     )
@@ -243,9 +243,9 @@ def test_the_alarms_of_a_fit_are_those_of_its_study_only(case):
     first, second = _model_alarms(fitted, case.study.limits, stability)
     assert first == "the input is a time"
     assert "gives no bound on the error" in second
-    # A plant from a file was accepted when it was loaded.
+    # A study may accept a plant from a file; its gains are not safer than the plant.
     loaded = dataclasses.replace(fitted, fit=None)
-    assert _model_alarms(loaded, case.study.limits, stability) == []
+    assert _model_alarms(loaded, case.study.limits, stability) == [first]
 
 
 def test_a_residual_of_another_model_is_refused(case, tmp_path):

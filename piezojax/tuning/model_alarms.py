@@ -21,16 +21,16 @@ def model_alarms(
 ) -> Iterator[str]:
     """Yield the alarms of the model of a plant, each with a next step.
 
-    They are those of its fit and of its check on other records, if it was ``fitted`` in
-    this study, and one if the tuned loop can be unstable, or its Ms can exceed
-    ``limit``, within the bound on the model's error. ``about`` is the origin of the
-    model; ``stability`` holds the linear loops "after".
+    They are those of its fit and of its check on other records, one if it was
+    ``fitted`` in this study without a bound on its error, and one if the tuned loop can
+    be unstable, or its Ms can exceed ``limit``, within that bound. ``about`` is the
+    origin of the model, also of one that a study accepts in spite of its alarms;
+    ``stability`` holds the linear loops "after".
     """
     bound = about.error_bound
-    if fitted:
-        yield from about.unsafe
-        if bound is None:
-            yield _no_bound(about)
+    yield from about.unsafe
+    if fitted and bound is None:
+        yield _no_bound(about)
     if bound is not None and "after" in stability.loops:
         yield from _error_alarm(bound, limit, stability)
 
