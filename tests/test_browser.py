@@ -315,7 +315,7 @@ def test_moved_sliders_show_what_their_gains_give(tuned, folders):
         assert share < 0.02
         assert float(moved) == pytest.approx(1e3 * float(rms[0]), rel=2 * share + 1e-3)
         assert shown != moved
-    report = pj.stability_report(loop, case.highest_reference)
+    report = pj.stability_report(loop, case.margin_reference)
     for name, value in (
         ("sensitivity peak", report.sensitivity_peak),
         ("gain margin", report.gain_margin_dB),

@@ -239,7 +239,7 @@ def test_gains_carry_the_alarms_of_their_plant(case):
         update={"unsafe": ["the input is a time"], "error_bound": None}
     )
     fitted = dataclasses.replace(case, plant_about=about)
-    stability = stability_reports({"after": case.loop}, case.highest_reference)
+    stability = stability_reports({"after": case.loop}, case.margin_reference)
     first, second = _model_alarms(fitted, case.study.limits, stability)
     assert first == "the input is a time"
     assert "gives no bound on the error" in second

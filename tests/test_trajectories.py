@@ -111,7 +111,7 @@ def test_another_part_of_a_file_is_held_out(folder):
             holdout[run, ::2], PATH[start : start + 100], atol=1e-6
         )
     np.testing.assert_allclose(tuning, holdout[:2])
-    assert case.highest_reference == pytest.approx(holdout.max())
+    assert case.margin_reference == pytest.approx(holdout.max())
     assert any("0.5 to 0.699 s of 1 s" in note for note in case.notes)
     require_reach(case, data)
     parts["later"]["start"] = 0.1

@@ -68,7 +68,7 @@ def learning_law(results: Path, named: Path | None) -> "LearningFilter":
 
     case, loop = load_loop(results, named)
     bound = case.plant_about.error_bound
-    highest = float(np.max(case.highest_reference))
+    highest = float(np.max(case.margin_reference))
     return learning_filter(loop, highest, case.study.dt, bound)
 
 

@@ -50,14 +50,15 @@ def stability_figure(stability: StabilityReports, title: str = "") -> Figure:
     """Draw the Bode and Nyquist plots of L, and |S| and |T|.
 
     If the branches of the hysteresis differ, the ascending one is drawn solid and the
-    descending one dashed.
+    descending one dashed, both at the reference of the margins.
     """
     picture = figure(9.0, 6.6)
     (gain, nyquist), (phase, sensitivity) = picture.subplots(2, 2)
     for panel in (phase, sensitivity):
         panel.sharex(gain)
     for name in stability.loops:
-        branches = stability.curves(name, _DECADES)
+        curves = stability.curves(name, _DECADES)
+        branches = {branch: curves[branch] for branch in LINES if branch in curves}
         for branch, curves in branches.items():
             style: dict[str, Any] = {
                 "color": LOOP_COLOURS.get(name, REFERENCE),

@@ -177,9 +177,9 @@ def typed(value: float, step: float | None) -> str:
 
 
 def stability_table(stability: StabilityReports) -> Table:
-    """Return the margins of each loop, on the worse branch of a hysteresis."""
+    """Return the worst margins of each loop over its branches and references."""
     table = Table(
-        title="margins for small motions, nominal plant, worse branch of hysteresis"
+        title="margins for small motions, nominal plant, worst branch and reference"
     )
     table.add_column("loop")
     for title in ("Ms", "gain margin", "phase margin", "delay margin"):

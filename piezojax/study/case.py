@@ -7,18 +7,19 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
 from ..catalog import CONTROLLERS, PLANTS
 from ..control.design_model import NoInverseError
 from ..core.about import About
-from ..core.arrays import as_array
+from ..core.arrays import as_array, as_signal
 from ..core.feedback import Feedback, Observation
 from ..core.paths import declared, get, replace, static_fields
 from ..core.progress import Progress, Silent
 from ..core.space import Space
-from ..core.system import System, accepts
+from ..core.system import System, accepts, rest_output
 from ..identification import Fit
 from ..identification.residual_record import ResidualRecord, load_residual
 from ..identification.response_model import ResponseModel
@@ -96,14 +97,31 @@ class Case:
             return TYPICAL_WIDTH if self.plant_about.small_motions else 0.0
         return given
 
-    @property
-    def highest_reference(self) -> float | tuple[float, ...]:
-        """Highest value of all references, um; a tuple on several axes.
+    @cached_property
+    def margin_reference(self) -> float | tuple[float, ...]:
+        """Operating point of the margins of a study, um; a tuple on several axes.
 
-        It is the operating point of the margins of a study.
+        It is the end of the range of all references that is farther from the plant's
+        rest point at 0 V: there the branches of a hysteresis differ most.
         """
-        peaks = np.max(self.references, axis=(0, 1))
-        return tuple(peaks.tolist()) if self.study.axes else float(peaks)
+        return self._ends[0]
+
+    @property
+    def nearer_reference(self) -> float | tuple[float, ...]:
+        """The other end of the range of all references, as ``margin_reference``."""
+        return self._ends[1]
+
+    @cached_property
+    def _ends(self) -> tuple[Any, Any]:
+        high, low = (f(self.references, axis=(0, 1)) for f in (np.max, np.min))
+        with jax.ensure_compile_time_eval():  # a program may need it first
+            rest = rest_output(self.loop.plant, as_signal(np.zeros_like(high)))
+        rest = np.stack(jax.tree.leaves(rest)).reshape(high.shape)
+        below = np.abs(low - rest) > np.abs(high - rest)
+        ends = np.where(below, low, high), np.where(below, high, low)
+        axes = self.study.axes
+        far, near = (tuple(x.tolist()) if axes else float(x) for x in ends)
+        return far, near
 
     def unit(self, path: str) -> str:
         """Return the declared unit of the parameter at ``path`` in the loop.

@@ -134,7 +134,7 @@ class Simulator:
 
     def _peaks(self, loop: Feedback) -> tuple[Array, Array]:
         """Return Ms and the state matrix of the closed loop, both for every branch."""
-        point = OperatingPoint(self.case.highest_reference, dt=self.case.study.dt)
+        point = OperatingPoint(self.case.margin_reference, dt=self.case.study.dt)
         models = [
             open_loop(loop, dataclasses.replace(point, branch=name))
             for name in BRANCHES

@@ -81,7 +81,7 @@ def judging(data: Data, case: Case, loop: Feedback) -> Data:
     Only the hold-out changes. ``data`` is returned as it is without a residual, and on
     several axes.
     """
-    study, highest = case.study, case.highest_reference
+    study, highest = case.study, case.margin_reference
     if not depends_on_loop(case) or isinstance(highest, tuple):
         return data
     samples = case.references.shape[1]

@@ -173,7 +173,7 @@ class Evaluator:
         """Return the margins on each of ``stages``, or None if no limit needs them."""
         if not uses(self.limits, "margins"):
             return None
-        study, highest = self._case.study, as_array(self._case.highest_reference)
+        study, highest = self._case.study, as_array(self._case.margin_reference)
         stages = own_stage(loop) if stages is None else stages
         width = 1 if study.axes else min(MARGIN_BLOCK, self._most)
         arguments = loop, tuple(self.limits), highest, study.dt, self.model_error

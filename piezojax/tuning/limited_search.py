@@ -79,16 +79,16 @@ INTERRUPTED = StabilityReports(problems={"after": "their computation was interru
 def exact_stability(case: Case, search: SearchState) -> StabilityReports:
     """Return the exact stability of the loops "before" and "after".
 
-    The operating point is the highest reference, where the branches of a hysteresis
-    differ most.
+    The operating points are both ends of the range of the references.
     """
     study = case.study
     after = case.space.put(case.loop, as_array(search.unit))
     return stability_reports(
         {"before": case.loop, "after": after},
-        case.highest_reference,
+        case.margin_reference,
         study.dt,
         study.axes.names if study.axes else (),
+        case.nearer_reference,
     )
 
 

@@ -106,7 +106,7 @@ def simulate_near(outcome: Outcome) -> NearGains | None:
 
     The range is halved until every set is stable; None if one is not stable in the
     smallest range either. The plant is the nominal one, references and noise are those
-    of the hold-out, and the margins are those at the highest reference.
+    of the hold-out, and the margins are those at the ``margin_reference``.
     """
     space, seed = outcome.case.space, outcome.case.study.seed
     tuned = np.asarray(space.to_unit(as_array([*outcome.result.gains.values()])))
@@ -171,7 +171,7 @@ def _program(outcome: Outcome) -> tuple[Callable, np.ndarray]:
     before, after = step_ends(np.asarray(signals.references))[NAMES.index(STEP)]
     step = np.where(np.arange(samples) > kept[0], after, before)
     signals = _with_run(signals, as_array(step), outcome)
-    point = OperatingPoint(case.highest_reference, dt=study.dt)
+    point = OperatingPoint(case.margin_reference, dt=study.dt)
     names = [margin.constraint for margin in MARGINS.values()]
 
     def one(unit: jax.Array) -> tuple[jax.Array, ...]:

@@ -63,7 +63,7 @@ def promised_figures(
         found.append(PromisedFigure(name, 1e3 * rms, "nm", relative.T @ relative))
     limits = tuple(n for n in study.limits if CONSTRAINTS[n].source == "margins")
     if limits:
-        highest = as_array(case.highest_reference)
+        highest = as_array(case.margin_reference)
         values, slope_of = _margins(unknowns, loop, limits, highest, study.dt, start)
         for name in limits:
             slope = np.asarray(slope_of[name])

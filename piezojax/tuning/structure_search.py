@@ -150,7 +150,7 @@ def _shown_modes(case: Case) -> tuple[list[PlantMode], list[str]]:
     a fit to noise. It is left out.
     """
     study = case.study
-    highest = case.highest_reference
+    highest = case.margin_reference
     assert isinstance(highest, float)  # structures are for one axis
     modes = plant_modes(case.loop.plant, highest, study.dt)
     bound = case.plant_about.error_bound

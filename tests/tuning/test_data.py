@@ -238,7 +238,7 @@ def test_the_holdout_is_the_worst_for_the_judged_loop():
     plain, judged = make_data(case), judging(make_data(case), case, case.loop)
     np.testing.assert_array_equal(plain.holdout.noise, judged.holdout.noise)
     np.testing.assert_array_equal(plain.tuning.disturbance, judged.tuning.disturbance)
-    reference = case.highest_reference
+    reference = case.margin_reference
     loop = suppression_of(case.loop, reference, 400, 0, case.study.dt)
     for one, other in zip(
         np.asarray(plain.holdout.disturbance),

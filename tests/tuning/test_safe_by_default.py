@@ -36,7 +36,7 @@ def tuned(folder, **tables):
 
 def exact(outcome):
     loop, dt = outcome.after, outcome.case.study.dt
-    return stability_report(loop, OperatingPoint(outcome.case.highest_reference, dt=dt))
+    return stability_report(loop, OperatingPoint(outcome.case.margin_reference, dt=dt))
 
 
 @pytest.fixture(scope="module")

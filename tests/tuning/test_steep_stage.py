@@ -54,7 +54,7 @@ def test_without_hysteresis_or_a_gain_there_is_none(tables):
 def test_limits_on_margins_hold_on_it():
     case = case_of()
     loops = [case.loop, replace(case.loop, {"plant.0.gain": RISE * 0.15})]
-    point = OperatingPoint(case.highest_reference, dt=case.study.dt)
+    point = OperatingPoint(case.margin_reference, dt=case.study.dt)
     expected = [stability_report(loop, point).sensitivity_peak for loop in loops]
     assert expected[1] > 1.2 * expected[0]
     evaluator = Evaluator(Clock(), case)

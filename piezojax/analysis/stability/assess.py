@@ -185,24 +185,31 @@ def stability_reports(
     reference: Any = 0.0,
     dt: float | None = None,
     axis_names: tuple[str, ...] = (),
+    other: Any = None,
 ) -> StabilityReports:
     """Return the stability of ``loops``, by name, on both branches at ``reference``.
 
     ``reference`` in um, ``dt`` in s. With ``axis_names`` the reference holds one number
-    for each axis, and only the branch with the smaller disk margin is reported. A loop
-    that cannot be linearised is listed in ``problems``; its error is not raised.
+    for each axis, and only the branch with the smaller disk margin is reported. On one
+    axis the reports at ``other``, if it is another reference, have the names of their
+    branches and of this reference. A loop that cannot be linearised is listed in
+    ``problems``; its error is not raised.
     """
     result = StabilityReports(axis_names=axis_names)
-    points = [OperatingPoint(reference, branch, dt=dt) for branch in BRANCHES]
+    points = {branch: OperatingPoint(reference, branch, dt=dt) for branch in BRANCHES}
+    if other not in (None, reference) and not axis_names:
+        points |= {
+            f"{branch} at {other:.4g} um": OperatingPoint(other, branch, dt=dt)
+            for branch in BRANCHES
+        }
     for name, loop in loops.items():
         try:
             if axis_names:
-                result.axes[name] = _worse_branch(loop, points)
+                result.axes[name] = _worse_branch(loop, [*points.values()])
                 continue
-            found = {point.branch: linear_loop(loop, point) for point in points}
+            found = {at: linear_loop(loop, point) for at, point in points.items()}
             result.reports[name] = {
-                point.branch: located_report(*found[point.branch], point)
-                for point in points
+                at: located_report(*found[at], point) for at, point in points.items()
             }
             result.loops[name] = {b: model for b, (model, _) in found.items()}
         # A failed analysis must not lose the tuned gains.
