@@ -47,6 +47,8 @@ class LoopFigures(NamedTuple):
     ``tracking`` and ``extremes`` hold arrays [plants, references, draws], ``steps``
     arrays [plants, steps]. ``margins`` are those of ``margin_figures``. ``extremes``,
     ``margins`` and ``steps`` are None unless a limit needs them. ``dt`` in s.
+    ``stable`` [plants] tells whether the loop is stable for small motions, None if that
+    was not asked for.
     """
 
     tracking: TrackingFigures
@@ -54,6 +56,7 @@ class LoopFigures(NamedTuple):
     margins: MarginFigures | None
     steps: StepFigures | None
     dt: float
+    stable: Any = None
 
 
 Source = Literal["tracking", "extremes", "margins", "steps"]
@@ -164,29 +167,46 @@ def margin_figures(
     loop: Feedback,
     point: OperatingPoint,
     error: Float[Array, " lines"] | None,
+    duration: float | None = None,
 ) -> MarginFigures:
     """Return the figures [branches] of those ``names`` that are margins.
 
     The loop is linearised at ``point``. The sensitivity peaks are those of
     ``peaks_of``, [branches, bands]. ``error`` is the bound on the relative model error
-    of a plant of one axis; it is None if no bound is known.
+    of a plant of one axis; it is None if no bound is known. ``duration`` (s) is that of
+    ``sensitivity``.
     """
     found: MarginFigures = {}
     if not _MARGINS.keys().isdisjoint(names):
-        S = sensitivities(loop, point)
+        S = sensitivities(loop, point, duration)
         found |= {
             name: jax.vmap(lambda one, of=of: of(one, error))(S)
             for name, of in _MARGINS.items()
             if name in names
         }
     if not _FOLLOWING.keys().isdisjoint(names):
-        followed, dt = references_followed(loop, point), point.sample_time(loop)
+        followed = references_followed(loop, point, duration)
+        dt = point.sample_time(loop)
         found |= {
             name: jax.vmap(lambda one, of=of: of(one, dt))(followed)
             for name, of in _FOLLOWING.items()
             if name in names
         }
     return found
+
+
+def without_unstable(margins: MarginFigures, stable: Any) -> MarginFigures:
+    """Return ``margins`` in which a plant that is not ``stable`` [plants] has none.
+
+    A truncated impulse response says nothing about a loop that is barely unstable.
+    """
+
+    def of(name: str, values: Array) -> Array:
+        none = jnp.inf if CONSTRAINTS[name].sense == "at most" else 0.0
+        known = jnp.asarray(stable).reshape(-1, *[1] * (values.ndim - 1))
+        return jnp.where(known, values, none)
+
+    return {name: of(name, values) for name, values in margins.items()}
 
 
 def _margin(name: str) -> Callable[[MarginFigures, float], Array]:
@@ -311,7 +331,7 @@ CONSTRAINTS: dict[str, Constraint] = {
 }
 """Constraints by their name in a study; each holds for every plant and reference of the
 objective. The margins, the bandwidth and the peak of y/r are those of the loop
-linearised at the highest reference, on both branches of the hysteresis. For a fitted
+linearised at the ``margin_reference`` of the case, on both branches. For a fitted
 plant the sensitivity peak and the delay margin are the worst within the error bound of
 its model. On several axes the sensitivity peak is the largest singular value of S, and
 the disk margin is a lower bound for simultaneous changes of all axes. The gain, phase

@@ -88,6 +88,6 @@ def _errors(figures: LoopFigures, driven: np.ndarray) -> np.ndarray:
 
     It is infinite where a run diverges or stays at a voltage limit.
     """
-    logarithms, lost = log_errors(figures.tracking)
+    logarithms, lost = log_errors(figures)
     means = np.exp(np.mean(logarithms[:, driven], axis=1))
     return np.where(lost, np.inf, means)

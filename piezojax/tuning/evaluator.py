@@ -14,10 +14,16 @@ from ..analysis.constraints import (
     LoopFigures,
     MarginFigures,
     uses,
+    without_unstable,
     worst_excess,
 )
+from ..analysis.stability.closed_poles import (
+    closed_matrices,
+    slowest_oscillation,
+    stable,
+)
 from ..analysis.stability.operating_point import OperatingPoint
-from ..analysis.stability.small_motion import lines
+from ..analysis.stability.small_motion import default_duration, lines
 from ..analysis.step_response import StepFigures, step_ends
 from ..core.arrays import as_array
 from ..core.feedback import Feedback
@@ -39,6 +45,13 @@ default number of an ensemble and the nominal plant."""
 
 CARRIED = 16
 """Number of plants whose margins a search computes if there are more than ``EVERY``."""
+
+SETTLED = 7.0
+"""Time constants of an oscillation after which 0.1 % of it is left."""
+
+MOST = 2**17
+"""Most samples of an impulse response. One that lasts longer is truncated; the poles
+tell whether the loop is stable."""
 
 RUN_BLOCK = 8
 """Plants on which runs are simulated in one call of a program."""
@@ -109,11 +122,21 @@ class Evaluator:
         """Return the figures of the study's limits, with the plants on the first axis.
 
         The runs are on ``stages``, the margins on ``margin_stages``, both stacked; None
-        means the plant of the loop alone.
+        means the plant of the loop alone. On stacked stages the poles of the closed
+        loops tell which are stable and how long their impulse responses last: where
+        that exceeds the duration for a search, the margins are those of longer ones.
         """
         tracking, extremes = self._runs(loop, signals, stages)
-        margins, steps = self._margins(loop, margin_stages), self._steps(loop, stages)
-        return LoopFigures(tracking, extremes, margins, steps, self._case.study.dt)
+        steps, dt = self._steps(loop, stages), self._case.study.dt
+        if margin_stages is None:
+            margins = self._margins(loop, None)
+            return LoopFigures(tracking, extremes, margins, steps, dt)
+        closed = np.asarray(self._on_margin_stages(_closed_on, loop, margin_stages))
+        known = stable(closed)
+        lasts = SETTLED * dt * np.max(slowest_oscillation(closed)[known], initial=0.0)
+        margins = self._margins(loop, margin_stages, _duration(lasts, dt))
+        margins = margins and without_unstable(margins, known)
+        return LoopFigures(tracking, extremes, margins, steps, dt, known)
 
     def _runs(
         self, loop: Feedback, signals: Signals, stages: Stage | None
@@ -169,15 +192,28 @@ class Evaluator:
         carried = jax.tree.map(lambda x: x[places], stages)
         return Carried(float(by[worst[0]]), carried, places)
 
-    def _margins(self, loop: Feedback, stages: Stage | None) -> MarginFigures | None:
+    def _margins(
+        self, loop: Feedback, stages: Stage | None, duration: float | None = None
+    ) -> MarginFigures | None:
         """Return the margins on each of ``stages``, or None if no limit needs them."""
         if not uses(self.limits, "margins"):
             return None
-        study, highest = self._case.study, as_array(self._case.margin_reference)
+        bound, dt = self._case.plant_about.error_bound, self._case.study.dt
+        error = bound and as_array(bound.supported(lines(dt, duration)))
         stages = own_stage(loop) if stages is None else stages
+        limits = tuple(self.limits)
+        return self._on_margin_stages(
+            _margins_on, loop, stages, limits, error, duration
+        )
+
+    def _on_margin_stages(
+        self, program: Any, loop: Feedback, stages: Stage, *arguments: Any
+    ) -> Any:
+        """Return ``program`` of the loop at the reference of margins on ``stages``."""
+        study, reference = self._case.study, as_array(self._case.margin_reference)
         width = 1 if study.axes else min(MARGIN_BLOCK, self._most)
-        arguments = loop, tuple(self.limits), highest, study.dt, self.model_error
-        return self._on_each(_margins_on, width, stages, *arguments)
+        arguments = loop, reference, study.dt, *arguments
+        return self._on_each(program, width, stages, *arguments)
 
     def _steps(self, loop: Feedback, stages: Stage | None) -> StepFigures | None:
         """Return the figures of steps on ``stages``, or None if no limit needs them."""
@@ -207,13 +243,34 @@ def _runs_on(
 def _margins_on(
     stages: Stage,
     loop: Feedback,
-    limits: tuple[str, ...],
-    highest: Array,
+    reference: Array,
     dt: float,
+    limits: tuple[str, ...],
     model_error: Array | None,
+    duration: float | None,
 ) -> MarginFigures:
-    point = OperatingPoint(highest, dt=dt)
-    return margins_on(limits, _around(loop), stages, point, model_error)
+    point = OperatingPoint(reference, dt=dt)
+    return margins_on(limits, _around(loop), stages, point, model_error, duration)
+
+
+@eqx.filter_jit
+def _closed_on(stages: Stage, loop: Feedback, reference: Array, dt: float) -> Array:
+    """Return the matrices of ``closed_matrices`` on each of ``stages``."""
+    dynamic, static = eqx.partition(stages, eqx.is_array)
+    point = OperatingPoint(reference, dt=dt)
+
+    def one(part: Any) -> Array:
+        return closed_matrices(_around(loop)(eqx.combine(part, static)), point)
+
+    return jax.lax.map(one, dynamic)
+
+
+def _duration(lasts: float, dt: float) -> float | None:
+    """Return the default duration (s), None, or a longer one, of few different ones."""
+    default = default_duration(dt)
+    if lasts <= default:
+        return None
+    return float(min(default * 2.0 ** np.ceil(np.log2(lasts / default)), MOST * dt))
 
 
 @eqx.filter_jit

@@ -73,15 +73,16 @@ def margins_on(
     stages: Stage | None,
     point: OperatingPoint,
     model_error: Float[Array, " lines"] | None,
+    duration: float | None = None,
 ) -> MarginFigures:
     """Return the margins [plants, branches] among ``limits`` on each of ``stages``.
 
     ``loop_of(stage)`` is the loop on a stage, ``model_error`` bounds the relative error
-    of its plant.
+    of its plant. ``duration`` (s) is that of ``sensitivity``.
     """
 
     def one(stage: Stage | None) -> MarginFigures:
-        return margin_figures(limits, loop_of(stage), point, model_error)
+        return margin_figures(limits, loop_of(stage), point, model_error, duration)
 
     # With several axes a whole batch of matrices would not fit into memory.
     one_axis = jnp.ndim(point.reference) == 0

@@ -110,9 +110,10 @@ class FrontPoint(BaseModel):
 class Perturbed(BaseModel):
     """Figures of the tuned gains on perturbed plants, drawn for the hold-out.
 
-    ``unstable_before`` and ``unstable`` count the plants on which a run diverges or
-    stays at a voltage limit. ``geomeans_before_um`` and ``geomeans_um`` hold, by plant,
-    the geometric mean of the errors of the driven axes, None where a loop is unstable.
+    ``unstable_before`` and ``unstable`` count the plants on which small motions grow,
+    or a run diverges or stays at a voltage limit. ``geomeans_before_um`` and
+    ``geomeans_um`` hold, by plant, the geometric mean of the errors of the driven axes,
+    None where a loop is unstable.
     ``geomean_rms_um`` and ``worst_rms_um`` are the median and the largest of
     ``geomeans_um``. ``median_better`` and ``worst_better`` are the median and the
     smallest ratio of the geometric means before and after, over the plants on which
@@ -154,7 +155,7 @@ class Perturbed(BaseModel):
         The error of a trace is that of its worst draw.
         """
         means, lost = [], []
-        for figures in (before.tracking, after.tracking):
+        for figures in (before, after):
             logarithms, unstable = log_errors(figures)
             means.append(logarithms)
             lost.append(unstable)
@@ -305,16 +306,19 @@ def scores(figures: TrackingFigures, names: tuple[str, ...]) -> Scores:
     )
 
 
-def log_errors(figures: TrackingFigures) -> tuple[np.ndarray, np.ndarray]:
+def log_errors(figures: LoopFigures) -> tuple[np.ndarray, np.ndarray]:
     """Return ln of the RMS errors (um) [plants, traces], and the lost plants.
 
-    The error of a trace is that of its worst draw. A plant is lost if a run on it
-    diverges or stays at a voltage limit.
+    The error of a trace is that of its worst draw. A plant is lost if small motions on
+    it grow, or a run diverges or stays at a voltage limit.
     """
-    rms = np.max(np.asarray(figures.rms_error), axis=2)
-    railed = np.max(np.asarray(figures.saturated), axis=(1, 2)) > RAILED
+    rms = np.max(np.asarray(figures.tracking.rms_error), axis=2)
+    lost = np.max(np.asarray(figures.tracking.saturated), axis=(1, 2)) > RAILED
+    lost |= ~np.all(np.isfinite(rms), axis=1)
+    if figures.stable is not None:
+        lost |= ~np.asarray(figures.stable)
     with np.errstate(divide="ignore"):
-        return np.log(rms), railed | ~np.all(np.isfinite(rms), axis=1)
+        return np.log(rms), lost
 
 
 def number(value: float) -> float | None:

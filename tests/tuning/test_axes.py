@@ -101,11 +101,27 @@ def test_figures_equal_those_of_a_run(outcome):
         assert found[f"Z:SIN5 Rx:SIN10 ({name})"] == pytest.approx(rms, rel=1e-9)
 
 
+def rests(outcome, plant):
+    """Return whether a small motion of the tuned loop on ``plant`` dies out."""
+    after, place = outcome.after, outcome.case.margin_reference
+    loop = pj.Feedback(after.controller, plant, after.actuator, after.sensor)
+    inputs = pj.loop_inputs(jnp.tile(jnp.asarray(place), (12_000, 1)))
+    state = loop.init(jnp.asarray(place))
+    pushed = jax.tree.map(lambda x: x + 1e-6, state.displacement)
+    log = packed(pj.simulate(loop, inputs, state._replace(displacement=pushed))[1])
+    return np.ptp(np.asarray(log.displacement)[-1000:], axis=0).max() < 1e-9
+
+
 def test_perturbed_plants_are_evaluated_separately(outcome):
     """Compare median and worst factor with runs of both loops on each plant."""
     found = outcome.result.perturbed
-    assert (found.plants, found.unstable_before, found.unstable) == (5, 0, 0)
     plants = outcome.case.ensemble.stages("holdout").plant
+    each = [jax.tree.map(lambda x, i=i: x[i], plants) for i in range(5)]
+    # The runs are too short to show an oscillation that grows slowly.
+    stable = [rests(outcome, plant) for plant in each]
+    unstable = stable.count(False)
+    assert 0 < unstable < 5
+    assert (found.plants, found.unstable_before, found.unstable) == (5, 0, unstable)
     signals = outcome.holdout
 
     @eqx.filter_jit
@@ -117,8 +133,7 @@ def test_perturbed_plants_are_evaluated_separately(outcome):
         return 0.5 * jnp.log(jnp.mean(miss**2, axis=0))
 
     factors = []
-    for i in range(5):
-        plant = jax.tree.map(lambda x, i=i: x[i], plants)
+    for plant in (plant for plant, kept in zip(each, stable, strict=True) if kept):
         gained = [
             log_error(
                 outcome.before, plant, signals.references[run], signals.noise[run, 0]

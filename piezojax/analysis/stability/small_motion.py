@@ -121,15 +121,15 @@ def sensitivities(
 
 
 def references_followed(
-    loop: Feedback, at: Any = 0.0
+    loop: Feedback, at: Any = 0.0, duration: float | None = None
 ) -> Complex[Array, "branches lines"]:
     """Return y/r of a loop of one axis, at the lines of ``sensitivities``.
 
-    It is the response of the displacement to a small impulse of the reference. ``at``
-    and the errors raised are those of ``sensitivities``.
+    It is the response of the displacement to a small impulse of the reference. The
+    arguments and the errors raised are those of ``sensitivities``.
     """
     point = OperatingPoint.at(at)
-    samples = _samples(point.sample_time(loop))
+    samples = _samples(point.sample_time(loop), duration)
 
     def one(side: ScalarLike) -> Float[Array, " samples"]:
         broken = cut(loop, point.signal, side, point.state)
@@ -152,17 +152,22 @@ def closed_loop_poles(loop: Feedback, at: Any = 0.0) -> Complex[Array, " order"]
     return jnp.linalg.eigvals(model.A - model.B @ model.C)
 
 
-def lines(dt: float) -> np.ndarray:
-    """Return the frequencies (Hz) of S of one axis for the default duration."""
-    return np.fft.rfftfreq(PADDING * _samples(dt), dt)
+def lines(dt: float, duration: float | None = None) -> np.ndarray:
+    """Return the frequencies (Hz) of S of one axis."""
+    return np.fft.rfftfreq(PADDING * _samples(dt, duration), dt)
 
 
 def _sides() -> Float[Array, " branches"]:
     return jnp.asarray([*BRANCHES.values()])
 
 
-def _samples(dt: float) -> int:
-    return max(round(DURATION / dt), LEAST)
+def default_duration(dt: float) -> float:
+    """Return the default length of the impulse response, s."""
+    return dt * max(round(DURATION / dt), LEAST)
+
+
+def _samples(dt: float, duration: float | None) -> int:
+    return round((default_duration(dt) if duration is None else duration) / dt)
 
 
 def _responses(
@@ -183,7 +188,7 @@ def _impulses(
     duration: float | None,
 ) -> Float[Array, "branches samples axes axes"]:
     signal, dt = point.signal, point.sample_time(loop)
-    samples = round(_samples(dt) if duration is None else duration / dt)
+    samples = _samples(dt, duration)
     impulse = _axes_impulse if isinstance(signal, tuple) else _impulse
 
     def one(side: ScalarLike) -> Float[Array, "samples axes axes"]:
