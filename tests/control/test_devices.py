@@ -11,7 +11,7 @@ from oracles import vendor_loops
 import piezojax as pj
 from piezojax.control import E727, NV200, PyRPL, Servo, Stabilizer
 from piezojax.core.serial import from_data, to_data
-from piezojax.core.system import Affine
+from piezojax.core.system import Affine, resolve
 from piezojax.report.tuning_tables import gains_table
 from piezojax.study import Study, build
 from piezojax.tuning.device_alarms import device_alarms
@@ -264,8 +264,16 @@ def test_a_stabilizer_ignores_small_errors():
 
 
 def test_a_servo_at_a_low_rate_checks_active_filters_only():
-    limits = {"lower": 0.0, "upper": 100.0, "dt": 1e-3}
-    assert float(Servo(1.0, 100.0, **limits).notch_frequency_1) == 1000.0
+    limits = {"lower": -1e6, "upper": 1e6, "dt": 1e-3}
+    plain = Servo(1.0, 100.0, notch_frequency_2=800.0, **limits)
+    assert float(plain.notch_frequency_1) == 1000.0
+    references, measured = REST + np.arange(2000.0), np.full(2000, REST)
+    # P = 1 and I dt = 0.1; the filters that are off have no hidden unstable mode.
+    error = references - REST
+    expected = 30.0 + error + 0.1 * np.cumsum(error)
+    for device in (resolve(plain), plain):
+        found = commands(device, references, measured)
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
     with pytest.raises(ValueError, match=r"notch_frequency_1 is 1000; .* below 500"):
         Servo(1.0, 100.0, notch_depth_1=0.5, **limits)
 

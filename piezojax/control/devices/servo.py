@@ -123,16 +123,13 @@ class Servo(Device):
             (self.notch_frequency_1, self.notch_width_1, self.notch_depth_1),
             (self.notch_frequency_2, self.notch_width_2, self.notch_depth_2),
         )
-        low_pass = LowPass(self.low_pass, self.dt, max(self.low_pass_order, 1))
+        order = self.low_pass_order
         return ServoLoop(
             SlewLimit(self.slew_rate, self.dt),
             in_series(),
             in_series(
-                *(
-                    Notch(frequency, 0.5 * width / frequency, depth, self.dt)
-                    for frequency, width, depth in notches
-                ),
-                low_pass if self.low_pass_order else None,
+                *(self._notch(*notch) for notch in notches),
+                LowPass(self.low_pass, self.dt, order) if order else None,
             ),
             self.proportional,
             integral,
@@ -143,3 +140,10 @@ class Servo(Device):
             self.feedforward,
             anti_windup=self.anti_windup,
         )
+
+    def _notch(self, frequency: Scalar, width: Scalar, depth: Scalar) -> Notch:
+        # A notch that is off passes its input at any frequency. At one above half the
+        # rate its poles, which the output hides, could be unstable.
+        valid = jnp.minimum(frequency, 0.25 / self.dt)
+        frequency = jnp.where(depth < 1.0, frequency, valid)
+        return Notch(frequency, 0.5 * width / frequency, depth, self.dt)
