@@ -288,6 +288,16 @@ def test_a_declared_range_ends_below_nyquist(study):
     assert found.upper < declared.typical[1]
 
 
+def test_a_factor_stays_within_the_limits_of_the_device(study):
+    device = {"type": "E727", "proportional": 0.1, "integral_time": 1e-3, "scale": 2.0}
+    device |= {"lower": 0.0, "upper": 100.0, "notch_frequency_1": 7e3}
+    path = "controller.notch_frequency_1"
+    changes = {"controller": device, "parameters": {path: {"within": 1.5}}}
+    (found,) = read(study(changes)).space.ranges().values()
+    assert found.upper == 9e3
+    assert found.lower == pytest.approx(7e3 / 1.5)
+
+
 @pytest.mark.parametrize(
     ("tune", "message"),
     [

@@ -49,15 +49,24 @@ class Range:
 
     @classmethod
     def of(cls, declared: Parameter) -> "Range | None":
-        """Return the typical Range of a declared parameter, or None if it has none.
-
-        Its upper end is at least 1 % below an exclusive upper limit.
-        """
+        """Return the typical Range of a declared parameter, or None if it has none."""
         if declared.typical is None:
             return None
         lower, upper = declared.typical
-        upper = min(upper, 0.99 * declared.below)
-        return cls(lower, upper, declared.scale, unit=declared.unit, step=declared.step)
+        return cls(
+            lower, upper, declared.scale, unit=declared.unit, step=declared.step
+        ).limited(declared)
+
+    def limited(self, declared: Parameter | None) -> "Range":
+        """Return the Range with its bounds inside the limits of a declared parameter.
+
+        Its upper end is at least 1 % below an exclusive upper limit.
+        """
+        if declared is None:
+            return self
+        lower = max(self.lower, declared.least)
+        upper = min(self.upper, declared.most, 0.99 * declared.below)
+        return dataclasses.replace(self, lower=lower, upper=upper)
 
     def inside(self) -> "Range":
         """Return the Range with its bounds moved inside, to multiples of the step."""

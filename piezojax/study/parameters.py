@@ -57,7 +57,8 @@ def _ranges(study: Study, loop: Feedback) -> tuple[dict[str, Range], tuple[str, 
             tables.setdefault(path, TunedTable())
     ranges = {path: _range(loop, path, table) for path, table in tables.items()}
     for path in tables.keys() - study.parameters.keys():
-        ranges[path] = _reaching(ranges[path], float(get(loop, path)))
+        bounds = _reaching(ranges[path], float(get(loop, path)))
+        ranges[path] = bounds.limited(declared(loop, path))
     switched_off = [
         path
         for path in tables.keys() - {*study.parameters, *study.tune}
@@ -76,9 +77,10 @@ def _ranges(study: Study, loop: Feedback) -> tuple[dict[str, Range], tuple[str, 
 
 
 def _range(loop: Feedback, path: str, table: TunedTable) -> Range:
-    where, start = f"parameters.{path}", table.start
+    where, start, known = f"parameters.{path}", table.start, declared(loop, path)
     table = table.bounded(float(get(loop, path)) if start is None else start, where)
-    return dataclasses.replace(table.range(declared(loop, path), where), start=start)
+    bounds = dataclasses.replace(table.range(known, where), start=start)
+    return bounds if table.within is None else bounds.limited(known)
 
 
 def _reaching(bounds: Range, start: float) -> Range:
