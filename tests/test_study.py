@@ -288,6 +288,35 @@ def test_a_declared_range_ends_below_nyquist(study):
     assert found.upper < declared.typical[1]
 
 
+SERVO = {"proportional": 0.1, "integral": 10.0, "lower": 0.0, "upper": 100.0}
+SERVO |= {"type": "Servo", "dt": 5e-5}
+WIRES = {"sensor_gain": 0.1, "amplifier_gain": 15.0}
+SWITCHED = {
+    "notch_frequency_1": SERVO,
+    "low_pass": SERVO,
+    "filter_1": {
+        **{"type": "PyRPL", "p": -0.1, "i": -10.0, "filter_1": 1e3, "dt": 5e-5},
+        **WIRES,
+    },
+}
+
+
+@pytest.mark.parametrize("name", SWITCHED)
+def test_a_filter_that_is_off_is_searched_below_half_the_rate(study, refusal, name):
+    changes = {"controller": SWITCHED[name], "parameters": GONE}
+    path = f"controller.{name}"
+    (found,) = read(study(changes | {"tune": [path]})).space.ranges().values()
+    assert (found.lower, found.upper) == (10.0, pytest.approx(9900.0, rel=1e-12))
+    controller = SWITCHED[name] | {name: 12e3}
+    message = refusal(changes | {"controller": controller, "tune": [path]})
+    assert message.startswith(f"{path} starts at 12000; its bounds 10 to 9900 must inc")
+    message = refusal(changes | {"parameters": {path: {"upper": 24e3}}})
+    assert message == (
+        f"parameters.{path}.upper: {name} in Hz is 24000; it must be finite and above "
+        "0 and below 10000"
+    )
+
+
 def test_a_factor_stays_within_the_limits_of_the_device(study):
     device = {"type": "E727", "proportional": 0.1, "integral_time": 1e-3, "scale": 2.0}
     device |= {"lower": 0.0, "upper": 100.0, "notch_frequency_1": 7e3}

@@ -33,7 +33,9 @@ class Parameter:
     of a pure number is "1"; a name in brackets, as in "[u]/um", stands for a unit that
     only an outer System knows (see ``System.part_units``). A frequency with
     ``below_nyquist`` must be below pi / dt in rad/s or 0.5 / dt in Hz, with the sample
-    time dt of the declaring System. A ``whole`` parameter is an integer, such as a
+    time dt of the declaring System. If it is ``switched``, it belongs to a filter that
+    may be off: that limit then holds for the values of a search, and the System itself
+    checks it for filters that are on. A ``whole`` parameter is an integer, such as a
     count. ``step`` is the smallest difference between two values that a device accepts.
     """
 
@@ -46,6 +48,7 @@ class Parameter:
     scale: Scale = "linear"
     typical: tuple[float, float] | None = None
     below_nyquist: bool = False
+    switched: bool = False
     whole: bool = False
     step: float | None = None
 
@@ -87,6 +90,7 @@ def parameter(
     scale: Scale = "linear",
     typical: tuple[float, float] | None = None,
     below_nyquist: bool = False,
+    switched: bool = False,
     whole: bool = False,
     step: float | None = None,
     converter: Callable[[Any], Any] = as_array,
@@ -113,6 +117,7 @@ def parameter(
         scale,
         typical,
         below_nyquist,
+        switched,
         whole,
         step,
     )
@@ -206,5 +211,6 @@ def check_declared(system: Any) -> None:
     for name, declared in sorted(declarations(system), key=lambda d: d[0] != "dt"):
         value = getattr(system, name)
         if value is not None:
-            declared = declared.at(system.dt) if declared.below_nyquist else declared
+            if declared.below_nyquist and not declared.switched:
+                declared = declared.at(system.dt)
             declared.check(name, value)

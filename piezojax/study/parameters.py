@@ -102,7 +102,8 @@ def _reaching(bounds: Range, start: float) -> Range:
 def check_value(system: System, path: str, value: float, where: str) -> None:
     """Rebuild ``system`` with ``value`` at ``path``, so that its constructors check it.
 
-    Raises ValueError, starting with ``where``, if a constructor refuses the value.
+    Raises ValueError, starting with ``where``, if a constructor refuses the value or if
+    it is outside the declared limits.
     """
     changed = to_data(replace(system, {path: value}))
     try:
@@ -111,6 +112,10 @@ def check_value(system: System, path: str, value: float, where: str) -> None:
         # from_data starts with the place in the System, which ``where`` already names.
         reason = str(error).split(": ", 1)[-1]
         raise ValueError(f"{where}: {reason}") from None
+    # A constructor does not check the frequencies of filters that are off.
+    declaration = declared(system, path)
+    if declaration is not None:
+        declaration.check(f"{where}: {path.split('.')[-1]}", value)
 
 
 def _tuned_paths(loop: Feedback, pattern: str) -> Iterable[str]:

@@ -244,6 +244,18 @@ def test_pyrpl_has_no_cut_off_above_19_9_mhz():
     assert float(typed.filter_1) == pytest.approx(125e6 / (2.0 * np.pi))
 
 
+def test_a_filter_of_pyrpl_that_is_on_lies_below_half_the_rate():
+    def on(frequency):
+        return PyRPL(p=0.0, i=1.0, filters=1, filter_1=frequency, **PITAYA, dt=1 / 3e4)
+
+    # 19.4 kHz is the nearest cut-off, but the simulation ends at 15 kHz.
+    assert float(on(14.9e3).typed().filter_1) == pytest.approx(125e6 / 2**12 / np.pi)
+    assert float(on(14.9e3).typed().filter_1) < 15e3
+    with pytest.raises(ValueError, match=r"filter_1 is 15000; .* below 15000"):
+        on(15e3)
+    assert float(pyrpl(p=0.0, i=1.0, filter_1=15e3).filter_1) == 15e3  # off
+
+
 def test_a_stabilizer_ignores_small_errors():
     """At 8 V the steps of single precision are 2^-9 codes: smaller errors vanish."""
     slow = stabilizer(p=-1e-6, i=1.0)

@@ -6,7 +6,7 @@ import math
 import jax
 import jax.numpy as jnp
 
-from ...core.arrays import Scalar, as_array, check_order
+from ...core.arrays import Scalar, as_array, check, check_option, check_order
 from ...core.parameter import parameter, rounded_fields, sample_time
 from ...dynamics.filters import LowPass
 from .servo_loop import Device, ServoLoop, in_series
@@ -36,6 +36,8 @@ def _cutoff(number: int):
         "Hz",
         f"cut-off of input filter {number}",
         above=0.0,
+        below_nyquist=True,
+        switched=True,
         scale="log",
         typical=(10.0, 1e6),
         default=1e4,
@@ -49,9 +51,9 @@ class PyRPL(Device):
     set point: a loop that raises the output when the reading is too low has negative
     gains. ``i`` is the frequency at which the integral has the gain 1. Gains are
     rounded as in the registers. The first ``filters`` of four low-passes of order 1 are
-    on, at the cut-offs of the module: 125 MHz / 2 pi divided by a power of two. The
-    integral stays between -4 and 4 V, the output between ``min_voltage`` and
-    ``max_voltage``. The derivative is disabled in the gate array.
+    on, at the cut-offs of the module: 125 MHz / 2 pi divided by a power of two, below
+    half the sampling rate. The integral stays between -4 and 4 V, the output between
+    ``min_voltage`` and ``max_voltage``. The derivative is disabled in the gate array.
 
     The gate array runs at 125 MHz; here the module is sampled at ``dt``, and its delay,
     about 0.3 us with the converters, belongs in ``computation`` of the study.
@@ -82,8 +84,6 @@ class PyRPL(Device):
     filters: int = parameter(
         "1",
         "number of input filters that are on",
-        least=0.0,
-        most=4.0,
         whole=True,
         static=True,
         default=0,
@@ -91,10 +91,21 @@ class PyRPL(Device):
 
     def __check_init__(self):
         check_order("min_voltage", self.min_voltage, "max_voltage", self.max_voltage)
+        check_option("filters", self.filters, range(len(FILTERS) + 1))
+        for name in FILTERS[: self.filters]:
+            check(name, getattr(self, name), below=0.5 / self.dt)
 
     def typed(self) -> "PyRPL":
-        """Return the module with the gains and cut-offs that its registers hold."""
-        cutoffs = {name: _available(getattr(self, name)) for name in FILTERS}
+        """Return the module with the gains and cut-offs that its registers hold.
+
+        The cut-off of a filter that is on stays below half the sampling rate.
+        """
+        cutoffs = {
+            name: _available(
+                getattr(self, name), 0.5 / self.dt if on < self.filters else math.inf
+            )
+            for on, name in enumerate(FILTERS)
+        }
         return dataclasses.replace(rounded_fields(self), **cutoffs)
 
     def loop(self) -> ServoLoop:
@@ -124,9 +135,13 @@ class PyRPL(Device):
         )
 
 
-def _available(cutoff: Scalar) -> Scalar:
-    """Return the nearest cut-off of the module; its gradient is that of ``cutoff``."""
-    highest = 1.0 / (2.0 * jnp.pi * CLOCK)
-    octaves = jnp.minimum(jnp.round(jnp.log2(cutoff / highest)), 0.0)
+def _available(cutoff: Scalar, below: float) -> Scalar:
+    """Return the nearest cut-off of the module that lies ``below`` a frequency in Hz.
+
+    Its gradient is that of ``cutoff``.
+    """
+    highest = 1.0 / (2.0 * math.pi * CLOCK)
+    most = jnp.minimum(jnp.ceil(jnp.log2(below / highest)) - 1.0, 0.0)
+    octaves = jnp.minimum(jnp.round(jnp.log2(cutoff / highest)), most)
     nearest = highest * 2.0**octaves
     return cutoff + jax.lax.stop_gradient(nearest - cutoff)

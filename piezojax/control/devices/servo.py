@@ -23,6 +23,8 @@ def _frequency(meaning: str):
         "Hz",
         meaning,
         above=0.0,
+        below_nyquist=True,
+        switched=True,
         scale="log",
         typical=(10.0, 1e5),
         default=1e3,
