@@ -406,6 +406,23 @@ def test_a_record_at_another_rate_than_the_device_is_refused(tmp_path):
         first_study(DEVICE_PLAN, {"response": "r.csv"}, 16e3)
 
 
+@pytest.mark.parametrize("structure", [None, "parallel"])
+def test_the_study_of_an_e727_holds_its_structure(record, structure):
+    loaded = read_record(record, time="time_s", input=1, output=2)
+    shown = Shown.by_record(loaded)
+    given = {"controller": "e727", "scale": 2.0, "structure": structure}
+    plan = planned(loaded, given)
+    table = tomllib.loads(first_study(plan, {"record": "r.csv"}, 2e4))["controller"]
+    assert table["structure"] == (structure or "unknown")
+    found = doubts(plan, shown)
+    assert len(found) == (structure is None)
+    assert not found or "docs/devices.md) and give it as --structure" in found[0]
+    plan = planned(loaded, given | {"controller": "nv200", "structure": None})
+    assert "structure" not in first_study(plan, {"record": "r.csv"}, 2e4)
+    with pytest.raises(ValueError, match="structure is 'both'; it must be one of"):
+        planned(loaded, given | {"structure": "both"})
+
+
 def test_a_device_without_a_scale_is_doubted_or_refused(record, tmp_path):
     loaded = read_record(record, time="time_s", input=1, output=2)
     shown = Shown.by_record(loaded)

@@ -48,12 +48,18 @@ QUESTIONS = {
         "with it [um/s^2]"
     ),
     "scale": Question("scale of the gains of the device, 0 if unknown [V/um]"),
+    "structure": Question(
+        "structure of the PID of the device: series, parallel or unknown", str
+    ),
     "lowest": Question("lowest position of the device's range [um]"),
     "highest": Question("highest position of the device's range [um]"),
 }
 """The questions by the name of their option; ``planned`` gives the defaults."""
 
-OF_DEVICES = {"scale": True, "lowest": True, "highest": True, "acceleration": False}
+OF_DEVICES = {
+    **dict.fromkeys(("scale", "structure", "lowest", "highest"), True),
+    "acceleration": False,
+}
 """Questions that concern only the controllers of devices (True), or only the others."""
 
 

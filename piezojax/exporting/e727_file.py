@@ -4,6 +4,7 @@ import re
 from collections.abc import Mapping, Sequence
 
 from ..control import E727
+from ..control.devices.e727 import UNKNOWN
 from ..control.devices.servo_loop import NO_SLEW
 from .device_file import DeviceFile, Value, value_of
 
@@ -53,8 +54,11 @@ def _notes(device: E727, saved: Mapping[str, str]) -> list[str]:
     slew = float(device.slew_rate) < NO_SLEW
     return [
         f"Scale: {float(device.scale):.6g} V/um for P = 1, as entered in the study.",
+        "Structure of the PID: ASSUMED, P multiplies all terms; measure it first."
+        if device.structure == UNKNOWN
+        else f"Structure of the PID: {device.structure}, as entered in the study.",
         "Options that the manual does not specify, as simulated: "
-        f"structure {device.structure}, anti-windup {device.anti_windup}, "
+        f"anti-windup {device.anti_windup}, "
         "the transfer function of a notch with a bandwidth other than 1.",
         "Item 1 is the axis; for 0x05000000 and 0x05000001 it is the input channel. "
         "Change it for other axes and channels.",

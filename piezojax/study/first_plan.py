@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from ..control.devices.e727 import STRUCTURES, UNKNOWN
+from ..core.arrays import check_option
 from ..identification import Record
 from ..identification.records.recognise import noise_rms
 from ..identification.records.response import FrequencyResponse
@@ -54,9 +56,9 @@ parameter may differ from the value of the design; None stands for declared boun
 
 MEASURE = (
     "measure it (python -m piezojax.identify LOOP --controller {}, with a record of "
-    "error and voltage, docs/devices.md) and give it as --scale"
+    "error and voltage, docs/devices.md) and give it as --{}"
 )
-"""How the scale of a device's gains is found; its name is left out."""
+"""How a property of a device is found; the names of device and option are left out."""
 
 _POSITIVE = {
     "frequency": "Hz",
@@ -137,6 +139,7 @@ class Plan:
     jumps, as smooth motions. ``controller`` is the name of a design. A device limits
     the slew alone; for it, ``scale`` is that of its gains (V/um; 0 if it is unknown and
     to be assumed), and its positions range from ``lowest`` to ``highest``.
+    ``structure`` is that of the PID of an E-727, None for other controllers.
     ``slew_rate`` is the largest one of the voltage, V/s; 0 is no limit.
     ``hysteresis`` is the relative width of the loop that the stage is assumed to have
     beyond the plant, None to assume none. Raises ValueError for values that no stage
@@ -158,9 +161,12 @@ class Plan:
     highest: float = 1.0
     slew_rate: float = 0.0
     hysteresis: float | None = None
+    structure: str | None = None
 
     def __post_init__(self):
         one_of(self.controller, ALL_DESIGNS)
+        if self.structure is not None:
+            check_option("structure", self.structure, STRUCTURES)
         for field in fields(self):
             value = getattr(self, field.name)
             if field.type is float and not np.isfinite(value):
@@ -237,6 +243,7 @@ def planned(shown: Shown, given: dict[str, Any]) -> Plan:
             "highest": _rounded(high),
             "slew_rate": _rounded(shown.slew or 0.0),
             "hysteresis": shown.hysteresis,
+            "structure": UNKNOWN if known.get("controller") == "e727" else None,
         }
         return Plan(**(suggested | known))
 
@@ -312,7 +319,12 @@ def doubts(plan: Plan, shown: Shown) -> list[str]:
     if plan.controller in DEVICES and plan.scale == 0.0:
         found.append(
             "the scale of the gains of the device is unknown: it is assumed, and the "
-            f"gains will have an alarm: {MEASURE.format(plan.controller)}"
+            f"gains will have an alarm: {MEASURE.format(plan.controller, 'scale')}"
+        )
+    if plan.structure == UNKNOWN:
+        found.append(
+            "the structure of the PID of the device is unknown: it is assumed, and the "
+            f"gains will have an alarm: {MEASURE.format(plan.controller, 'structure')}"
         )
     return found
 

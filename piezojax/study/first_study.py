@@ -62,7 +62,7 @@ def first_study(
     """
     if plan.controller == "e727" and plan.scale == 0.0:
         raise ValueError(
-            f"the E-727 needs the scale of its gains: {MEASURE.format('e727')}"
+            f"the E-727 needs the scale of its gains: {MEASURE.format('e727', 'scale')}"
         )
     measured = "record" if "record" in plant else "response"
     device = plan.controller in DEVICES
@@ -184,6 +184,11 @@ scale = $scale
 slew = $slew
 """)
 
+_STRUCTURE = """\
+# "series": P multiplies all terms of the PID; "parallel": P, I and D are summed. The
+# measurement of the scale finds it, too; "unknown" is simulated as "series".
+structure = {}
+"""
 
 _TUNE = """\
 # Parameters to tune, with the bounds that the controller declares. [parameters] may
@@ -234,6 +239,8 @@ def _controller(plan: Plan, dt: float) -> str:
     text = _DEVICE.substitute(values)
     if plan.controller == "nv200":
         text += f"range = {_toml([plan.lowest, plan.highest])} # of the positions, um\n"
+    if plan.structure is not None:
+        text += _STRUCTURE.format(_toml(plan.structure))
     return text
 
 

@@ -237,6 +237,8 @@ def main():
     options, lines = [], []
     if chosen.device:
         options = ["--controller", chosen.device, "--scale", "9.3"]
+        if chosen.device == "e727":
+            options += ["--structure", "series"]
         numbers = [n for n in numbers if has_device_rate(n)]
     for number in numbers:
         stage = forty_stages.stage(number)

@@ -65,6 +65,18 @@ def test_the_voltage_does_not_depend_on_the_scale(scale):
     assert other.integral_time == first.integral_time
 
 
+def test_the_loop_does_not_depend_on_the_structure_of_the_device():
+    stage = PLANTS["lag"]()
+    loops = [
+        designed("e727", stage, structure=each).loop()
+        for each in ("unknown", "series", "parallel")
+    ]
+    gains = np.array([(x.proportional, x.integral, x.derivative) for x in loops])
+    np.testing.assert_allclose(gains[1:], gains[:1].repeat(2, 0), rtol=1e-12)
+    with pytest.raises(ValueError, match=r"structure is 'ideal'; .* series, parallel"):
+        designed("e727", stage, structure="ideal")
+
+
 def test_the_notch_lies_at_the_strongest_mode():
     modes = Affine(0.1) >> pj.dynamics.Modes((400.0, 900.0), (0.02, 0.02), DT, (0.8,))
     assert designed("nv200", modes).notchf == pytest.approx(900.0, rel=1e-3)

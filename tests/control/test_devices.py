@@ -337,11 +337,25 @@ def test_a_study_tunes_the_values_of_the_device():
     assert rows == [f"{value:.3f}" for value in gains.values()]
 
 
+def test_a_structure_that_is_not_stated_raises_an_alarm():
+    gains = {"proportional": 0.02, "integral_time": 2e-4}
+    (alarm,) = device_alarms(e727(**gains))
+    assert alarm.startswith("the structure of the PID of the E-727 is assumed")
+    assert "integral and derivative may act 50 times as strongly" in alarm
+    assert "identify RECORD --controller e727) and set controller.structure" in alarm
+    for structure in ("series", "parallel"):
+        assert list(device_alarms(e727(**gains, structure=structure))) == []
+    # Models saved before name the structure that was simulated, or none.
+    data = to_data(e727(**gains, structure="series"))
+    assert from_data(data).structure == "series"
+    del data["structure"]
+    assert from_data(data).cautions == (alarm,)
+
+
 def test_a_measured_scale_raises_no_alarm():
     assert list(device_alarms(nv200(scale=2.0))) == []
     inner = pj.control.FilteredCommand(nv200(), Affine())
     assert len(list(device_alarms(inner))) == 1
-    assert list(device_alarms(e727(proportional=1.0, integral_time=1.0))) == []
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import configparser
 import csv
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -117,6 +118,10 @@ def test_what_an_e727_file_leaves_out(tmp_path):
     assert "SPA 1 0x07000200 2000\n" in text
     assert "SPA 1 0x05000001" not in text
     assert "The unit of the slew rate is not in the manual" in text
+    assert "Structure of the PID: ASSUMED, P multiplies all terms" in text
+    stated = dataclasses.replace(slow, structure="parallel")
+    text = exported(stated, tmp_path / "c")[".txt"].read_text()
+    assert "Structure of the PID: parallel, as entered in the study." in text
 
 
 def settings(path):

@@ -9,7 +9,7 @@ from ...core.parameter import declarations
 from ...core.system import Affine, System, rest_output
 from ...dynamics.plant_modes import plant_modes
 from ..design_model import CROSSOVER, DesignModel, design_model
-from .e727 import E727, HIGHEST
+from .e727 import E727, HIGHEST, UNKNOWN
 from .nv200 import NV200, SLEW_OFF
 from .servo_loop import NO_SLEW
 
@@ -84,21 +84,24 @@ def e727(
     limits: Limits,
     *,
     scale: float,
+    structure: str = UNKNOWN,
     slew: float | None = None,
 ) -> E727:
     """Return an E-727 whose integral and notch suit the plant between ``limits`` (V).
 
     The notch lies at the plant's strongest mode, but not above 9 kHz, the limit of the
     device.
-    ``scale`` (V/um) is that of the device; ``slew`` um/s limits the setpoint, and
-    ``dt`` is in s. Raises ValueError as ``nv200``.
+    ``scale`` (V/um) and ``structure`` are those of the device; ``slew`` um/s limits the
+    setpoint, and ``dt`` is in s. Raises ValueError as ``nv200`` and for an unknown
+    ``structure``.
     """
     model = _rising(plant, dt, limits)
 
     def device(start: Start) -> E727:
+        outer = scale if structure == "parallel" else start.proportional
         return E727(
             proportional=start.proportional / scale,
-            integral_time=start.proportional / start.integral,
+            integral_time=outer / start.integral,
             scale=scale,
             lower=limits[0],
             upper=limits[1],
@@ -106,6 +109,7 @@ def e727(
             notch_rejection_1=0.1,
             slew_rate=NO_SLEW if slew is None else slew,
             dt=dt,
+            structure=structure,
         )
 
     return _designed(model, plant, device)

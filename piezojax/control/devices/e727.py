@@ -16,7 +16,8 @@ from .servo_loop import (
     require_rate,
 )
 
-STRUCTURES = ("series", "parallel")
+UNKNOWN = "unknown"
+STRUCTURES = (UNKNOWN, "series", "parallel")
 NOTCH_METHODS = {0: "bilinear", 1: "hold"}
 """Discretisation of a notch by the value of parameter 0x08000600."""
 
@@ -69,7 +70,8 @@ class E727(Device):
     rate (0x07000200) limits the setpoint.
 
     Options that the manual does not specify: ``structure`` is "series", in which P
-    multiplies all terms, or "parallel"; ``anti_windup`` is "none" or "hold". A notch is
+    multiplies all terms, or "parallel"; "unknown" is simulated as "series", with a
+    caution. ``anti_windup`` is "none" or "hold". A notch is
     ``(s^2 + 2 r k w s + w^2) / (s^2 + 2 k w s + w^2)`` with rejection r and bandwidth
     k; with k = 1 both interpretations of the manual agree. ``notch_method``
     (0x08000600) is 0, bilinear, or 1, zero-order hold; method 2 of the device is not
@@ -114,7 +116,7 @@ class E727(Device):
     filter_type: int = parameter(
         "1", "filter of the measurement", whole=True, static=True, default=0
     )
-    structure: str = eqx.field(static=True, default="series")
+    structure: str = eqx.field(static=True, default=UNKNOWN)
     anti_windup: str = eqx.field(static=True, default="none")
 
     def __check_init__(self):
@@ -124,10 +126,23 @@ class E727(Device):
         check_option("notch_method", self.notch_method, NOTCH_METHODS)
         check_option("filter_type", self.filter_type, (0, 1))
 
+    @property
+    def cautions(self) -> tuple[str, ...]:
+        """Caution that the structure is assumed, if it is."""
+        if self.structure != UNKNOWN:
+            return ()
+        return (
+            "the structure of the PID of the E-727 is assumed, P multiplies all terms: "
+            "on the device integral and derivative may act "
+            f"{1.0 / float(self.proportional):.3g} times as strongly as simulated; "
+            "measure it (python -m piezojax.identify RECORD --controller e727) and set "
+            "controller.structure",
+        )
+
     def loop(self) -> ServoLoop:
         """Return the loop of the parameters, without rounding them."""
         gain = self.scale * self.proportional
-        outer = gain if self.structure == "series" else self.scale
+        outer = self.scale if self.structure == "parallel" else gain
         notches = (
             (self.notch_frequency_1, self.notch_bandwidth_1, self.notch_rejection_1),
             (self.notch_frequency_2, self.notch_bandwidth_2, self.notch_rejection_2),
