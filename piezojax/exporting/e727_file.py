@@ -25,8 +25,6 @@ IDS = {
 }
 """Numbers of the parameters, in the order in which they are written."""
 
-MOST_REJECTION = 0.98
-
 _TRIPLE = re.compile(r"(\d+)\s+(0[xX][0-9a-fA-F]+|\d{5,})[\s=]+([^\s=]+)")
 
 
@@ -35,13 +33,6 @@ def _key(number: int, item: str = "1") -> str:
 
 
 def _values(device: E727) -> list[Value]:
-    for name in ("notch_rejection_1", "notch_rejection_2"):
-        rejection = float(getattr(device, name))
-        if MOST_REJECTION < rejection < 1.0:
-            raise ValueError(
-                f"{name} ({_key(IDS[name])}) is {rejection:.6g}; it must be at least 0 "
-                f"and at most {MOST_REJECTION}, or 1, which is off"
-            )
     return [
         value_of(device, name, _key(number))
         for name, number in IDS.items()

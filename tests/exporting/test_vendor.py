@@ -124,6 +124,28 @@ def test_what_an_e727_file_leaves_out(tmp_path):
     assert "Structure of the PID: parallel, as entered in the study." in text
 
 
+@pytest.mark.parametrize(
+    ("rejection", "accepted"),
+    [(0.5, 0.5), (0.98, 0.98), (0.985, 0.98), (0.995, 1.0), (1.0, 1.0)],
+)
+def test_a_rejection_that_the_device_refuses_is_rounded(rejection, accepted, tmp_path):
+    device = changed(PI, notch_rejection_1=rejection, notch_rejection_2=rejection)
+    found = spa(exported(device, tmp_path / "x")[".txt"])
+    assert (found[0x08000200], found[0x08000201]) == (accepted, accepted)
+    # The loop is simulated with the value of the file.
+    as_written = changed(PI, notch_rejection_1=accepted, notch_rejection_2=accepted)
+    for mine, own in zip(
+        jax.tree.leaves(device.resolved()),
+        jax.tree.leaves(as_written.resolved()),
+        strict=True,
+    ):
+        assert mine == own
+    slope = jax.grad(
+        lambda r: changed(PI, notch_rejection_1=r).typed().notch_rejection_1
+    )
+    assert slope(rejection) == 1.0
+
+
 def settings(path):
     return dict(line.split("=", 1) for line in body(path))
 
@@ -298,8 +320,8 @@ def changed(device, **values):
         ),
         (changed(JENA, notchb=1700.0), "notchb is 1700 and 2 notchf is 1622.8"),
         (
-            changed(PI, notch_rejection_1=0.99),
-            r"\(1 0x08000200\) is 0.99; it must be at least 0 and at most 0.98, or 1",
+            changed(PI, notch_rejection_1=1.01),
+            r"notch_rejection_1 is 1.01; it must be .* at least 0 and at most 1",
         ),
         (
             changed(PI, notch_frequency_2=9.5e3),

@@ -1,6 +1,10 @@
 """Closed loop of the PI E-727."""
 
+import dataclasses
+
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 
 from ...core.arrays import Scalar, check_option, check_order
 from ...core.parameter import parameter, sample_time
@@ -23,6 +27,9 @@ NOTCH_METHODS = {0: "bilinear", 1: "hold"}
 
 HIGHEST = 9e3
 """Highest frequency of the notches and of the measurement's filter, Hz."""
+
+MOST_REJECTION = 0.98
+"""Largest rejection of a notch that is on."""
 
 
 def _frequency(meaning: str):
@@ -73,7 +80,8 @@ class E727(Device):
     multiplies all terms, or "parallel"; "unknown" is simulated as "series", with a
     caution. ``anti_windup`` is "none" or "hold". A notch is
     ``(s^2 + 2 r k w s + w^2) / (s^2 + 2 k w s + w^2)`` with rejection r and bandwidth
-    k; with k = 1 both interpretations of the manual agree. ``notch_method``
+    k; with k = 1 both interpretations of the manual agree. The device accepts r up to
+    0.98, and 1; values between them are rounded. ``notch_method``
     (0x08000600) is 0, bilinear, or 1, zero-order hold; method 2 of the device is not
     modelled.
 
@@ -126,6 +134,14 @@ class E727(Device):
         check_option("notch_method", self.notch_method, NOTCH_METHODS)
         check_option("filter_type", self.filter_type, (0, 1))
 
+    def typed(self) -> "E727":
+        """Return the device with the rejections that it accepts."""
+        return dataclasses.replace(
+            self,
+            notch_rejection_1=_accepted(self.notch_rejection_1),
+            notch_rejection_2=_accepted(self.notch_rejection_2),
+        )
+
     @property
     def cautions(self) -> tuple[str, ...]:
         """Caution that the structure is assumed, if it is."""
@@ -161,3 +177,12 @@ class E727(Device):
             self.dt,
             anti_windup=self.anti_windup,
         )
+
+
+def _accepted(rejection: Scalar) -> Scalar:
+    """Return the nearest accepted rejection; its gradient is that of ``rejection``."""
+    middle = 0.5 * (MOST_REJECTION + 1.0)
+    limited = jnp.minimum(rejection, MOST_REJECTION)
+    nearest = jnp.where(rejection > middle, 1.0, limited)
+    zero = rejection - jax.lax.stop_gradient(rejection)
+    return jax.lax.stop_gradient(nearest) + zero
