@@ -110,9 +110,10 @@ def numpy_loop(reference, draws):
         measured = against_aliasing(sensed_late(sensed(y)) + 0.05 * draw)
         step = 30.0 / 2**12
         integral += DT * INTEGRAL * (r - step * np.round(measured / step))
-        clipped = min(max(integral, -4.0), 20.0)
-        slewed += min(max(clipped - slewed, -most), most)
+        # Steps -171 and 854 of the converter are beyond the limits, -4 and 20 V.
         step = 24.0 / 2**10
+        clipped = min(max(integral, -170.0 * step), 853.0 * step)
+        slewed += min(max(clipped - slewed, -most), most)
         voltages.append(step * np.round(slewed / step))
         y = pole * y + (1.0 - pole) * smooth(late(voltages[-1]))
     return np.array(moved), np.array(voltages)
@@ -314,6 +315,29 @@ def test_the_lower_slew_rate_applies():
         assert float(get(case.loop, "actuator.slew.rate")) == pytest.approx(expected)
 
 
+@pytest.mark.parametrize(
+    "entries",
+    [
+        {"lower": -20.0, "upper": 120.0, "bits": 16},
+        {"lower": -4.0, "upper": 20.0, "bits": 10, "slew_rate": 1e5},
+        {"lower": 0.1, "upper": 0.9, "resolution": 0.25},
+        {"lower": 0.0, "upper": 120.0, "bits": 12},
+        {"lower": -0.3, "upper": 0.3, "resolution": 0.1},
+    ],
+)
+def test_a_converter_does_not_exceed_the_limits(entries):
+    actuator = case_of({"actuator": entries}).loop.actuator
+    lower, upper = entries["lower"], entries["upper"]
+    span = upper - lower
+    step = entries.get("resolution") or span / 2 ** entries["bits"]
+    commands = lower + span * np.linspace(-1.0, 2.0, 200).repeat(50)
+    voltage = simulate(actuator, jnp.asarray(commands), actuator.init(lower))[1]
+    voltage = np.asarray(voltage)
+    assert lower - 1e-12 <= voltage.min() < lower + step
+    assert upper - step < voltage.max() <= upper + 1e-12
+    np.testing.assert_allclose(voltage, step * np.round(voltage / step), atol=1e-12)
+
+
 def test_the_limit_refuses_a_sensor_with_dynamics():
     loop = case_of(LINEAR, OTHER).loop
     noise = np.random.default_rng(0).standard_normal((1, 2, 800))
@@ -358,6 +382,11 @@ def test_the_limit_refuses_a_sensor_with_dynamics():
         ("sensor", {"delay": -1e-3}, "sensor.delay is -0.001: .* greater than"),
         ("actuator", {"computation": -1.0}, "actuator.computation is -1.0"),
         ("actuator", {"bandwith": 1e3}, "did you mean 'bandwidth'"),
+        (
+            "actuator",
+            {"bits": 1, "range": 100.0},
+            "the converter has steps of 50 V, less than two of them from -4 to 20 V",
+        ),
         (
             "actuator",
             {"computation": 60.0, "delay": 3e-4},

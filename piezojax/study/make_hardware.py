@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 from ..core.axes import PerAxis
+from ..core.space import Range
 from ..core.system import Series, System, series
 from ..dynamics import AnalogLowPass, FractionalDelay
 from ..hardware import Quantiser, Saturation, Sensor, SensorResponse, SlewLimit
@@ -27,19 +28,35 @@ def per_axis(study: Study, make: Callable[[int], Any]) -> Any:
 def make_actuator(study: Study) -> System:
     """Return the actuator: limits, slew rate and converter.
 
-    It maps the command (V) to the voltage (V), which the controller knows.
+    It maps the command (V) to the voltage (V), which the controller knows. Raises
+    ValueError for a converter with less than two steps between the limits.
     """
     table = study.actuator
 
     def parts(axis: int) -> Parts:
         lower, upper = _of(table.lower, axis), _of(table.upper, axis)
-        found: Parts = {"limits": Saturation(lower, upper)}
+        step = _step(table, axis, upper - lower)
+        found: Parts = {"limits": _limits(lower, upper, step)}
         rate = slew_rate(study, axis)
         if rate is not None:
             found["slew"] = SlewLimit(rate, study.dt)
-        return found | _converter(study, table, axis, upper - lower)
+        return found | _converter(step)
 
     return _systems(study, parts)
+
+
+def _limits(lower: float, upper: float, step: float | None) -> Saturation:
+    """Return the limits, which are steps of the converter if there is one.
+
+    From another limit, the converter could round to a step beyond it.
+    """
+    inner = Range(lower, upper, step=step).inside()
+    if inner.lower >= inner.upper:
+        raise ValueError(
+            f"actuator: the converter has steps of {step:g} V, less than two of them "
+            f"from {lower:g} to {upper:g} V: give more bits or a smaller resolution"
+        )
+    return Saturation(inner.lower, inner.upper)
 
 
 def make_amplifier(study: Study) -> System | None:
@@ -88,7 +105,7 @@ def make_sensor(study: Study) -> System:
         if cut_off is not None:
             order = table.anti_aliasing_order or 1
             found["anti_aliasing"] = AnalogLowPass(cut_off, study.dt, order)
-        return found | _converter(study, table, axis)
+        return found | _converter(_step(table, axis))
 
     return _systems(study, parts)
 
@@ -116,14 +133,20 @@ def slew_rate(study: Study, axis: int) -> float | None:
     return min((rate for rate in rates if rate is not None), default=None)
 
 
-def _converter(
-    study: Study, table: ElectronicsTable, axis: int, span: float | None = None
-) -> Parts:
-    """Return the converter, if any; its bits divide the range, by default ``span``."""
-    resolution = _of(table.resolution, axis)
+def _step(
+    table: ElectronicsTable, axis: int, span: float | None = None
+) -> float | None:
+    """Return the step of the converter, or None if there is none.
+
+    Its bits divide the range, by default ``span``.
+    """
     if table.bits is not None:
-        resolution = (_of(table.range, axis) or span) / 2**table.bits
-    return {} if resolution is None else {"converter": Quantiser(resolution)}
+        return (_of(table.range, axis) or span) / 2**table.bits
+    return _of(table.resolution, axis)
+
+
+def _converter(step: float | None) -> Parts:
+    return {} if step is None else {"converter": Quantiser(step)}
 
 
 def _response(
