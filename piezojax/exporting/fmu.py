@@ -135,11 +135,8 @@ def _interface(
         f", this->{slot.name if slot.name in inputs else 'start_' + slot.name}"
         for slot in code.starts
     )
-    given = [f"this->{name}" for name in inputs]
-    step = code.step_call(
-        ["&this->state", "&this->parameters", *given],
-        [f"this->{name}" for name in outputs],
-    )
+    given = ["&this->parameters", *(f"this->{name}" for name in inputs)]
+    found = [f"this->{name}" for name in outputs]
     return FMU.format(
         name=code.name,
         guid=guid,
@@ -154,13 +151,14 @@ def _interface(
             for number, variable in enumerate(variables)
         ),
         defaults="\n".join(
-            f"    {variable.place} = {float(variable.start)!r};"
+            f"    {variable.place} = {float(variable.start or 0.0)!r};"
             for variable in variables
-            if variable.start is not None and "parameters." not in variable.place
+            if "parameters." not in variable.place
         ),
         settable=sum(variable.causality != "output" for variable in variables),
         begin=begin,
-        step=step,
+        rest=code.step_block(["&state", *given], found),
+        step=code.step_call(["&this->state", *given], found),
     )
 
 

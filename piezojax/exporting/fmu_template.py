@@ -83,8 +83,11 @@ status fmi2EnterInitializationMode(void *it) {{
 }}
 
 static void begin(instance *this) {{
+    {name}_state state;
     {name}_prepare(&this->parameters);
     {name}_init(&this->state, &this->parameters{begin});
+    state = this->state; /* a copy, because the first sample comes later */
+{rest}
     this->started = 1;
 }}
 

@@ -2,6 +2,7 @@
 
 import shutil
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import pytest
 import piezojax as pj
 from piezojax.catalog import CONTROLLERS, PLANTS
 from piezojax.core.serial import to_data
+from piezojax.core.system import rest_output
 
 fmpy = pytest.importorskip("fmpy")
 pytestmark = pytest.mark.skipif(
@@ -41,6 +43,9 @@ class Unit:
             unzipDirectory=fmpy.extract(path, folder),
         )
         self.fmu.instantiate()
+        self.begin(**start)
+
+    def begin(self, **start):
         self.set(**start)
         self.fmu.setupExperiment()
         self.fmu.enterInitializationMode()
@@ -108,6 +113,38 @@ def test_the_loop_of_two_fmus_equals_the_simulation(paths, tmp_path):
         (y,) = plant.step(input=u)
     assert np.ptp(found) > 5.0
     np.testing.assert_allclose(found, log.displacement, rtol=0, atol=1e-9)
+
+
+def test_the_outputs_before_the_first_step_are_those_at_rest(paths, tmp_path):
+    controller = Unit(
+        paths["controller"],
+        str(tmp_path / "controller"),
+        **{"reference": 5.0, "next_reference": 5.0, "measured": 5.0},
+        start_applied=37.5,
+    )
+    plant = Unit(paths["plant"], str(tmp_path / "plant"), input=37.5)
+    rest = float(rest_output(PLANTS["p753_stage"](), 37.5))
+    for unit, expected in ((controller, 37.5), (plant, rest)):
+        for _ in range(2):
+            found = unit.fmu.getReal(unit.outputs)
+            assert found == [pytest.approx(expected, rel=1e-12)]
+        assert unit.step() == [pytest.approx(expected, rel=1e-9)]
+        unit.fmu.reset()
+        assert unit.fmu.getReal(unit.outputs) == [0.0]
+    plant.begin(input=20.0)
+    expected = float(rest_output(PLANTS["p753_stage"](), 20.0))
+    assert plant.fmu.getReal(plant.outputs) == [pytest.approx(expected, rel=1e-12)]
+
+
+def test_every_output_is_that_at_rest(tmp_path):
+    stage = PLANTS["mirror"]()
+    unit = Unit(exported(stage, tmp_path / "x"), str(tmp_path / "unpacked"))
+    inputs = [name for name in unit.numbers if name.startswith("input")]
+    unit.fmu.reset()
+    values = 1.0 + np.arange(len(inputs))
+    unit.begin(**dict(zip(inputs, values, strict=True)))
+    expected = jax.tree.leaves(rest_output(stage, tuple(map(jnp.asarray, values))))
+    np.testing.assert_allclose(unit.fmu.getReal(unit.outputs), expected, rtol=1e-9)
 
 
 def test_a_step_of_several_samples_holds_the_input(paths, tmp_path):
