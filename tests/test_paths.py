@@ -1,6 +1,6 @@
 """Parameters by path."""
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,6 +15,7 @@ from piezojax import (
 from piezojax.catalog import CONTROLLERS, PLANTS, p753
 from piezojax.control import PID, DisturbanceObserverControl
 from piezojax.core.arrays import as_array, as_scalars
+from piezojax.core.axes import PerAxis
 from piezojax.core.parameter import (
     PartUnits,
     declarations,
@@ -25,6 +26,7 @@ from piezojax.core.parameter import (
 from piezojax.core.paths import (
     declared,
     get,
+    leaf_path,
     matching,
     parameters,
     replace,
@@ -158,6 +160,45 @@ class Bank(System):
 
     def step(self, state, input):
         return state, input
+
+
+class Pair(NamedTuple):
+    """Two gains in um/V."""
+
+    rising: Any
+    falling: Any
+
+
+class Bent(System):
+    """Two gains behind each other, and a named part."""
+
+    gains: Pair
+    part: System
+
+    def init(self, input=0.0):
+        return self.part.init(input)
+
+    def step(self, state, input):
+        return self.part.step(state, self.gains.rising * input)
+
+
+@pytest.mark.parametrize(
+    "system",
+    [
+        p753.loop(p753.pid()),
+        series(bank=Bank((1.0, 2.0), 5.0, 3.0, 1e-3), lag=FirstOrderLag(1e-3, 1e-3)),
+        Affine() >> (Affine() + FirstOrderLag(1e-3, 1e-3)),
+        PerAxis((series(a=Affine(), b=Affine()), Affine() >> Affine()), ("x", "y")),
+        PerAxis((Affine(), Affine())),
+        Bent(Pair(as_array(1.0), as_array(2.0)), series(inner=Affine())),
+    ],
+)
+def test_the_path_of_a_leaf_is_found_by_its_keys(system):
+    dynamic = eqx.filter(system, eqx.is_array)
+    leaves = jax.tree_util.tree_flatten_with_path(dynamic)[0]
+    assert [leaf_path(dynamic, keys) for keys, _ in leaves] == [*parameters(system)]
+    for keys, leaf in leaves:
+        assert get(system, leaf_path(dynamic, keys)) is leaf
 
 
 def test_declarations_are_found_by_path():

@@ -2,12 +2,13 @@
 
 import dataclasses
 import difflib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from fnmatch import fnmatchcase
 from typing import Any, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax.tree_util import SequenceKey, keystr
 
 from .arrays import as_array
 from .axes import PerAxis
@@ -40,6 +41,26 @@ def parameters(system: Any, prefix: str = "") -> dict[str, Any]:
         else:
             leaves.update(parameters(child, f"{path}."))
     return leaves
+
+
+def leaf_path(system: Any, keys: Iterable[Any]) -> str:
+    """Return the path of the leaf of ``system`` with the given keys of JAX.
+
+    The field ``parts`` of a Series or PerAxis, which JAX counts, is not in a path.
+    """
+    names, node, rest = [], system, iter(keys)
+    for key in rest:
+        if isinstance(node, Series | PerAxis):
+            key = next(rest)
+        children = _children(node)
+        name = keystr((key,), simple=True)
+        if isinstance(node, tuple) and name in getattr(node, "_fields", ()):
+            name = str(node._fields.index(name))
+        elif isinstance(key, SequenceKey) and children:
+            name = list(children)[key.idx]
+        names.append(name)
+        node = children.get(name)
+    return ".".join(names)
 
 
 def scalars(system: Any) -> dict[str, float]:

@@ -35,7 +35,10 @@ class Driven(System):
     the voltage of the actuator (V), after its limits.
     """
 
-    part_units: ClassVar[PartUnits] = {"controller": {"u": "V"}}
+    part_units: ClassVar[PartUnits] = {
+        "controller": {"u": "V"},
+        "actuator": {"input": "V"},
+    }
 
     controller: System
     actuator: System

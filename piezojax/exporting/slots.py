@@ -8,7 +8,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import keystr
 
+from ..core.paths import leaf_path
 from ..scalar.c_source import TYPES, Precision
 
 PREPARED = "prepared"
@@ -38,12 +40,13 @@ class Interface(NamedTuple):
 def slots(tree: Any, word: str) -> list[Slot]:
     """Return a slot for each leaf of ``tree``; an array is one slot.
 
+    Its name contains the field ``parts`` of a Series or PerAxis, its path does not.
+
     ``word`` is the prefix of a name that is empty or begins with a digit.
     """
     found, taken = [], {PREPARED}
     for keys, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
-        path = ".".join(jax.tree_util.keystr((key,), simple=True) for key in keys)
-        name = re.sub(r"\W+", "_", path)
+        name = re.sub(r"\W+", "_", keystr(keys, simple=True, separator="."))
         if not name or name[0].isdigit():
             name = f"{word}_{name}".rstrip("_")
         base, count = name, 1
@@ -51,7 +54,8 @@ def slots(tree: Any, word: str) -> list[Slot]:
             count += 1
             name = f"{base}_{count}"
         taken.add(name)
-        found.append(Slot(path, name, leaf.dtype, math.prod(jnp.shape(leaf))))
+        size = math.prod(jnp.shape(leaf))
+        found.append(Slot(leaf_path(tree, keys), name, leaf.dtype, size))
     return found
 
 

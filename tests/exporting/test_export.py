@@ -14,12 +14,14 @@ from golden import golden_vectors
 
 import piezojax as pj
 from piezojax.catalog import CONTROLLERS, PLANTS
+from piezojax.core.axes import PerAxis
 from piezojax.core.parameter import parameter
 from piezojax.core.serial import to_data
-from piezojax.core.system import System
+from piezojax.core.system import System, series
 from piezojax.exporting import Driven, Seen
 from piezojax.exporting.prepared import prepared_nodes
 from piezojax.exporting.products import shorten_products
+from piezojax.hardware import Quantiser, SlewLimit
 from piezojax.scalar import NotScalarError, trace
 from piezojax.scalar.c_source import DOUBLE, statements
 from piezojax.scalar.graph import CONSTANT, INPUT
@@ -184,6 +186,55 @@ def test_a_parameter_outside_its_limits_is_found(tmp_path):
         ["cc", "-std=c99", "-o", binary, program, files[1], "-lm"], check=True
     )
     assert subprocess.run([binary]).returncode == 5  # the fifth parameter
+
+
+DRIVE = series(
+    limits=pj.Saturation(-20.0, 120.0),
+    slew=SlewLimit(1e5, 5e-5),
+    converter=Quantiser(0.01),
+)
+
+
+@compiled
+@pytest.mark.parametrize("axes", [1, 3])
+def test_the_limits_of_parameters_inside_parts_are_found(axes, tmp_path):
+    drive = DRIVE if axes == 1 else PerAxis((DRIVE,) * axes, ("z", "x", "y"))
+    controller = CONTROLLERS["p753_pid" if axes == 1 else "p558_pid"]()
+    about = ABOUT.model_copy(
+        update={"actuator": to_data(drive), "reference_ranges": [(0.0, 10.0)] * axes}
+    )
+    header, source, *_ = pj.export(controller, tmp_path / "c", about=about)
+    at = "actuator_parts_" if axes == 1 else "actuator_parts_2_parts_"
+    fields = header.read_text().partition("} controller_parameters;")[0]
+    rows = fields.rpartition("typedef struct {\n")[2].splitlines()
+    changes = {}  # number of each field in the struct
+    for field, meaning in (
+        ("1_rate", "slew rate, above 0, unit V/s"),
+        ("2_resolution", "step of the converter, above 0, unit V"),
+    ):
+        row = f"    double {at}{field}; /* {meaning} */"
+        changes[f"{at}{field}"] = 1 + rows.index(row)
+    if axes > 1:  # a field of the controller's part of an axis
+        name = "controller_parts_1_anti_windup"
+        (row,) = (row for row in rows if row.startswith(f"    double {name};"))
+        assert "at least 0, unit 1/s" in row
+        changes[name] = 1 + rows.index(row)
+    (tmp_path / "program.c").write_text(
+        f'#include <stdio.h>\n#include "{header}"\n'
+        "int main(void) {\n"
+        "    controller_parameters p = controller_defaults(), changed = p;\n"
+        '    printf("%d\\n", controller_check(&p));\n'
+        + "".join(
+            f"    changed = p;\n    changed.{name} = -1.0;\n"
+            '    printf("%d\\n", controller_check(&changed));\n'
+            for name in changes
+        )
+        + "    return 0;\n}\n"
+    )
+    command = ["cc", "-std=c99", "-o", "program", "program.c", source, "-lm"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+    done = subprocess.run([tmp_path / "program"], capture_output=True, text=True)
+    assert done.stdout.split() == ["0", *map(str, changes.values())]
 
 
 @compiled
