@@ -17,6 +17,9 @@ Memory = tuple[Scalar, ...]
 ITERATIONS = 20
 """Newton steps for a polynomial P; bisection replaces one that leaves the bracket."""
 
+FAR = 1e9
+"""Input (V) that no model reaches: the end of an inverse without a range."""
+
 PLAYS, FINER = 10, 2
 """Operators of a fitted Prandtl-Ishlinskii model that move in every cycle over the
 range of a record, and factor by which they are closer for several records."""
@@ -139,11 +142,15 @@ def invert_plays(
     weights: Memory,
     memory: Memory,
     wanted: Scalar,
+    least: Scalar,
+    most: Scalar,
 ) -> Scalar:
     """Return the input x at which P(x) + sum weights play(x) equals ``wanted``.
 
     The plays start from ``memory``, in which two plays must not differ by more than
-    their thresholds do.
+    their thresholds do. The sum must rise with x from ``least`` to ``most``. For a
+    value that it does not reach there, P continues along its tangent, and only the
+    plays move that begin to move in this range.
     """
     slope, constant = as_array(0.0), as_array(0.0)
     low, high = as_array(-jnp.inf), as_array(jnp.inf)
@@ -152,11 +159,12 @@ def invert_plays(
     for r, w, m in zip(thresholds, weights, memory, strict=True):
         moving, reach, resting = moving + w, reach + w * r, resting - w * m
         upper, lower = m + r, m - r
-        rises = (
+        # Beyond the range P may fall, so that the sum there says nothing.
+        rises = (upper <= most) & (
             wanted
             > polynomial_part(polynomial, upper) + moving * upper - reach + resting
         )
-        falls = (
+        falls = (lower >= least) & (
             wanted
             < polynomial_part(polynomial, lower) + moving * lower + reach + resting
         )
@@ -168,20 +176,29 @@ def invert_plays(
     linear = polynomial[0] + slope
     if len(polynomial) == 1:
         return rest / linear
-    return _root((linear, *polynomial[1:]), rest, low, high)
+    ends = jax.lax.stop_gradient((least, most))
+    return _root((linear, *polynomial[1:]), rest, low, high, ends)
 
 
-def _root(polynomial: Memory, value: Scalar, low: Scalar, high: Scalar) -> Scalar:
+def _root(
+    polynomial: Memory,
+    value: Scalar,
+    low: Scalar,
+    high: Scalar,
+    ends: tuple[Scalar, Scalar],
+) -> Scalar:
     """Return x at which ``polynomial`` equals ``value``, between ``low`` and ``high``.
 
-    Either limit may be infinite.
+    Either limit may be infinite. Beyond its ``ends`` the polynomial continues along its
+    tangents.
     """
     fixed, target, low, high = jax.lax.stop_gradient((polynomial, value, low, high))
     x = jnp.clip(target / jnp.where(fixed[0] > 0.0, fixed[0], jnp.inf), low, high)
     for _ in range(ITERATIONS):
-        error = polynomial_part(fixed, x) - target
+        reached, slope = _continued(fixed, x, ends)
+        error = reached - target
         low, high = jnp.where(error < 0.0, x, low), jnp.where(error > 0.0, x, high)
-        newton = x - error / _rising(fixed, x)
+        newton = x - error / slope
         middle = 0.5 * (low + high)
         middle = jnp.where(jnp.isfinite(middle), middle, x)
         # At the root rounding decides on which side a step ends.
@@ -190,12 +207,20 @@ def _root(polynomial: Memory, value: Scalar, low: Scalar, high: Scalar) -> Scala
         x = jnp.where(inside | arrived, newton, middle)
     # One more step, its slope held constant, has the derivative of the implicit
     # function.
-    return x - (polynomial_part(polynomial, x) - value) / _rising(fixed, x)
+    reached, slope = _continued(polynomial, x, ends)
+    return x - (reached - value) / jax.lax.stop_gradient(slope)
 
 
-def _rising(polynomial: Memory, x: Scalar) -> Scalar:
-    """Return the slope of ``polynomial`` at x, infinite where it does not rise."""
-    derivative = jnp.zeros_like(x)
+def _continued(
+    polynomial: Memory, x: Scalar, ends: tuple[Scalar, Scalar]
+) -> tuple[Scalar, Scalar]:
+    """Return ``polynomial`` at x and its slope, infinite where it does not rise.
+
+    Beyond its ``ends`` the polynomial continues along its tangents.
+    """
+    inside = jnp.clip(x, *ends)
+    slope = jnp.zeros_like(x)
     for i, coefficient in reversed(list(enumerate(polynomial, 1))):
-        derivative = derivative * x + i * coefficient
-    return jnp.where(derivative > 0.0, derivative, jnp.inf)
+        slope = slope * inside + i * coefficient
+    reached = polynomial_part(polynomial, inside) + slope * (x - inside)
+    return reached, jnp.where(slope > 0.0, slope, jnp.inf)

@@ -2,12 +2,13 @@
 
 from typing import ClassVar
 
-from ..core.arrays import Scalar, ScalarLike, Scalars, as_array, as_scalars
+from ..core.arrays import Scalar, ScalarLike, Scalars, as_array, as_scalars, check_order
 from ..core.parameter import parameter
 from ..core.recipe import Extent, Fittable, Part, Recipe, rest_starts
 from .inverse import Inverse, check_rising
 from .model import Hysteresis, Laws, turning_point_laws
 from .plays import (
+    FAR,
     Memory,
     advance_plays,
     check_invertible,
@@ -76,9 +77,10 @@ class PrandtlIshlinskii(Hysteresis, Fittable):
         )
 
     def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:
-        if len(self.polynomial) > 1:
-            check_rising(self, lower, upper)
-        return InversePrandtlIshlinskii(self)
+        if len(self.polynomial) == 1:
+            return InversePrandtlIshlinskii(self)
+        check_rising(self, lower, upper)
+        return InversePrandtlIshlinskii(self, lower, upper)
 
 
 class InversePrandtlIshlinskii(Inverse):
@@ -94,15 +96,22 @@ class InversePrandtlIshlinskii(Inverse):
     a Prandtl-Ishlinskii operator. The state is that of the model, so that a controller
     can advance it with the voltage applied after clipping.
 
-    Raises ValueError for thresholds that do not ascend, an empty polynomial, or, with a
-    linear P, weights for which the output does not rise with the input. With terms
-    above the first in P the output must rise over the inputs in use; otherwise the
-    voltage is finite but wrong.
+    With terms above the first in P the output must rise from ``lower`` to ``upper``
+    (V), by default for any input; otherwise the voltage is finite but wrong. For an
+    output that the model does not reach between them, the voltage lies beyond them,
+    where P continues along its tangent.
+
+    Raises ValueError for thresholds that do not ascend, an empty polynomial, ``lower >=
+    upper``, or, with a linear P, weights for which the output does not rise with the
+    input.
     """
 
     model: PrandtlIshlinskii
+    lower: Scalar = parameter("V", "lowest voltage at which P is used", default=-FAR)
+    upper: Scalar = parameter("V", "highest voltage at which P is used", default=FAR)
 
     def __check_init__(self):
+        check_order("lower", self.lower, "upper", self.upper)
         check_invertible(
             self.model.polynomial, self.model.thresholds, self.model.weights
         )
@@ -115,7 +124,13 @@ class InversePrandtlIshlinskii(Inverse):
         """Return the voltage (V) for which the model's next output is ``wanted``."""
         model = self.model
         return invert_plays(
-            model.polynomial, model.thresholds, model.weights, state, as_array(wanted)
+            model.polynomial,
+            model.thresholds,
+            model.weights,
+            state,
+            as_array(wanted),
+            self.lower,
+            self.upper,
         )
 
     def operator(self) -> PrandtlIshlinskii:

@@ -4,13 +4,14 @@ from typing import ClassVar, NamedTuple
 
 import jax.numpy as jnp
 
-from ..core.arrays import Scalar, ScalarLike, Scalars, as_array, as_scalars
+from ..core.arrays import Scalar, ScalarLike, Scalars, as_array, as_scalars, check_order
 from ..core.parameter import parameter, sample_time
 from ..core.recipe import Extent, Fittable, Part, Recipe, rest_starts
 from ..core.space import Range
 from .inverse import Inverse, check_rising
 from .model import STEP, Hysteresis, Laws
 from .plays import (
+    FAR,
     Memory,
     advance_plays,
     check_invertible,
@@ -105,14 +106,14 @@ class RateDependentPrandtlIshlinskii(Hysteresis, Fittable):
         )
 
     def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:
-        if len(self.polynomial) > 1:
-            # The slopes are those at rest; the rate only moves the corners between
-            # them.
-            at_rest = PrandtlIshlinskii(
-                self.polynomial, self.thresholds, self.weights, self.rest_input
-            )
-            check_rising(at_rest, lower, upper)
-        return InverseRateDependentPrandtlIshlinskii(self)
+        if len(self.polynomial) == 1:
+            return InverseRateDependentPrandtlIshlinskii(self)
+        # The slopes are those at rest; the rate only moves the corners between them.
+        at_rest = PrandtlIshlinskii(
+            self.polynomial, self.thresholds, self.weights, self.rest_input
+        )
+        check_rising(at_rest, lower, upper)
+        return InverseRateDependentPrandtlIshlinskii(self, lower, upper)
 
 
 class InverseRateDependentPrandtlIshlinskii(Inverse):
@@ -120,12 +121,16 @@ class InverseRateDependentPrandtlIshlinskii(Inverse):
 
     Input f(k) in um, output u(k) in V. The thresholds of the next step are known, so
     the step is inverted as in ``InversePrandtlIshlinskii``, exactly at every rate. The
-    state is that of the model; the errors are those of that class.
+    state is that of the model; ``lower``, ``upper`` and the errors are those of that
+    class.
     """
 
     model: RateDependentPrandtlIshlinskii
+    lower: Scalar = parameter("V", "lowest voltage at which P is used", default=-FAR)
+    upper: Scalar = parameter("V", "highest voltage at which P is used", default=FAR)
 
     def __check_init__(self):
+        check_order("lower", self.lower, "upper", self.upper)
         check_invertible(
             self.model.polynomial, self.model.thresholds, self.model.weights
         )
@@ -143,4 +148,6 @@ class InverseRateDependentPrandtlIshlinskii(Inverse):
             model.weights,
             state.plays,
             as_array(wanted),
+            self.lower,
+            self.upper,
         )

@@ -195,6 +195,91 @@ def test_out_of_reach_the_voltage_and_its_gradient_are_finite():
         assert np.all(np.isfinite(found))
 
 
+ENDS = (0.0, 100.0)
+
+
+@st.composite
+def bent(draw):
+    """Return models that rise from 0 to 100 V and fall soon after one of the ends.
+
+    Also return inputs, and outputs as shares of the reach of the next step.
+    """
+    slopes = draw(st.floats(0.02, 0.5)), draw(st.floats(0.002, 0.1))
+    first, last = slopes if draw(st.booleans()) else slopes[::-1]
+    # P' is the line from one slope to the other, plus a parabola that is 0 at the ends
+    # and takes at most nine tenths of the smaller slope in the middle.
+    curve = draw(st.floats(-0.9, 0.9)) * min(first, last) * 4.0
+    linear, square = (last - first + curve) / 100.0, -curve / 100.0**2
+    polynomial = np.array([first, 0.5 * linear, square / 3.0])
+    gaps = draw(st.lists(st.floats(0.5, 30.0), min_size=4, max_size=4))
+    weights = draw(st.lists(st.floats(0.0, 0.02), min_size=4, max_size=4))
+    inputs = draw(st.lists(st.floats(*ENDS), min_size=3, max_size=3))
+    shares = draw(st.lists(st.floats(0.0, 1.0), min_size=8, max_size=8))
+    return polynomial, np.cumsum(gaps), np.array(weights), inputs, np.array(shares)
+
+
+def next_output(polynomial, thresholds, weights, memory, x):
+    """Return the output for the input x."""
+    plays = np.clip(memory, x - thresholds, x + thresholds)
+    return polynomial @ np.array([x, x**2, x**3]) + weights @ plays
+
+
+def bisected(wanted, *at):
+    """Return the input between the ends at which the next output is ``wanted``."""
+    low, high = ENDS
+    for _ in range(80):
+        middle = 0.5 * (low + high)
+        falls_short = next_output(*at, middle) < wanted
+        low, high = (middle, high) if falls_short else (low, middle)
+    return 0.5 * (low + high)
+
+
+@jax.jit
+def solved(inverse, state, wanted):
+    """Return voltages and their derivatives by the wanted outputs."""
+    return jax.vmap(jax.value_and_grad(lambda f: inverse.solve(state, f)))(wanted)
+
+
+@pytest.mark.parametrize("kind", INVERSES)
+@settings(max_examples=100)
+@given(bent())
+def test_the_inverse_holds_where_p_falls_outside_the_range(kind, case):
+    polynomial, thresholds, weights, inputs, shares = case
+    rate = (0.0, DT) if kind is RateDependentPrandtlIshlinskii else ()
+    model = kind(polynomial, thresholds, weights, *rate, inputs[0])
+    inverse = INVERSES[kind](model, *ENDS)
+    state, memory = model.init(inputs[0]), np.full(4, inputs[0])
+    for x in inputs[1:]:
+        state = model.step(state, x)[0]
+        memory = np.clip(memory, x - thresholds, x + thresholds)
+    at = polynomial, thresholds, weights, memory
+    low, high = (next_output(*at, end) for end in ENDS)
+    wanted = low + shares * (high - low)
+    steepest = 10.0 / min(polynomial[0], polynomial @ np.array([1.0, 200.0, 3e4]))
+    for voltage, slope, f in zip(*solved(inverse, state, wanted), wanted, strict=True):
+        assert next_output(*at, voltage) == pytest.approx(f, abs=1e-9)
+        assert voltage == pytest.approx(bisected(f, *at), abs=1e-5)
+        assert 0.0 < slope < 1.001 * steepest
+
+
+def test_plays_that_begin_to_move_beyond_the_range_rest():
+    """P falls from 111 V on, and the widest play would move from 145 V on."""
+    thresholds, weights = (10.0, 20.0, 30.0, 45.0), (0.005,) * 4
+    model = PrandtlIshlinskii((0.1, -4.5e-4), thresholds, weights, 100.0)
+    state, output = model.step(model.init(100.0), 100.0)
+    inverse = model.inverse(*ENDS)
+    assert inverse.solve(state, output) == pytest.approx(100.0, abs=1e-9)
+    # Out of reach the voltage still rises, along the tangent of P, 0.01 um/V.
+    beyond, slopes = solved(inverse, state, output + np.array([0.01, 0.1, 1.0]))
+    np.testing.assert_allclose(beyond, 100.0 + np.array([1.0, 10.0, 100.0]), rtol=1e-9)
+    np.testing.assert_allclose(slopes, 100.0, rtol=1e-9)
+    widening = RateDependentPrandtlIshlinskii(
+        model.polynomial, thresholds, weights, 1e-3, DT, 100.0
+    )
+    found = widening.inverse(*ENDS).solve(widening.init(100.0), output)
+    assert found == pytest.approx(100.0, abs=1e-9)
+
+
 def test_the_inverse_drives_a_stage_in_open_loop():
     model = MODELS["plain cubic"]
     control = InverseFeedforward(inverse_of(model))
