@@ -160,6 +160,18 @@ def test_step_rises_once_after_a_tenth_of_a_period(second):
     np.testing.assert_array_equal(values, np.where(second >= 0.1, 3.0, 1.0))
 
 
+@pytest.mark.parametrize("rate", [20_000, 10_000, 48_000])
+@pytest.mark.parametrize("frequency", [1, 7, 10, 30, 50, 100, 400])
+def test_jumps_are_at_their_sample(frequency, rate):
+    time, k = signals.time_grid(1.0, float(rate)), np.arange(rate)
+    # Whole numbers tell in which half period sample k is.
+    high = (2 * k * frequency // rate) % 2
+    found = signals.square(time, float(frequency), 5.0, 1.0)
+    np.testing.assert_array_equal(found, 1.0 + 10.0 * high)
+    found = signals.step(time, float(frequency), 5.0)
+    np.testing.assert_array_equal(found, 5.0 * (10 * k * frequency >= rate))
+
+
 def test_triangle_has_one_speed(second):
     values = signals.triangle(second, 10.0, 5.0)
     speeds = np.abs(np.diff(values)) * RATE

@@ -34,6 +34,14 @@ def time_grid(duration: float, rate: float) -> Time:
     return as_array(np.arange(samples) / rate)
 
 
+def _reached(periods: Time) -> Time:
+    """Return a number of periods for signals that jump, a billionth larger.
+
+    Rounding would otherwise delay some jumps by a sample.
+    """
+    return periods + 1e-9
+
+
 @jax.jit
 def constant(
     time: Time,
@@ -53,7 +61,7 @@ def step(
     offset: ScalarLike = 0.0,
 ) -> Time:
     """Step from ``offset`` up by ``amplitude`` after a tenth of a period."""
-    return offset + amplitude * (time * frequency >= 0.1).astype(time.dtype)
+    return offset + amplitude * (_reached(time * frequency) >= 0.1).astype(time.dtype)
 
 
 @jax.jit
@@ -64,7 +72,7 @@ def square(
     offset: ScalarLike = 0.0,
 ) -> Time:
     """Alternate between ``offset`` and ``offset + 2 amplitude``."""
-    high = jnp.mod(time * frequency, 1.0) >= 0.5
+    high = jnp.mod(_reached(time * frequency), 1.0) >= 0.5
     return offset + 2.0 * amplitude * high.astype(time.dtype)
 
 
@@ -137,7 +145,7 @@ def piecewise_sine(
     offset: ScalarLike = 0.0,
 ) -> Time:
     """PWSW: periods of the sine at 100, 100, 50 and 15 % of A, repeated."""
-    period = jnp.floor(time * frequency + 1e-9).astype(jnp.int32) % 4
+    period = jnp.floor(_reached(time * frequency)).astype(jnp.int32) % 4
     share = jnp.asarray([1.0, 1.0, 0.5, 0.15])[period]
     return offset + share * (sine(time, frequency, amplitude))
 
@@ -211,7 +219,7 @@ def prbs(
     Each value is held for 1/``frequency`` s.
     """
     bits = np.random.default_rng(seed).integers(0, 2, 4096)
-    slot = jnp.floor(time * frequency + 1e-9).astype(jnp.int32) % bits.size
+    slot = jnp.floor(_reached(time * frequency)).astype(jnp.int32) % bits.size
     return offset + 2.0 * amplitude * jnp.asarray(bits, time.dtype)[slot]
 
 
