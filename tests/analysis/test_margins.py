@@ -110,6 +110,19 @@ def test_the_closed_loop_response_equals_that_of_a_run(pair):
     assert report.following.closed_loop_peak == pytest.approx(found.max(), rel=1e-4)
 
 
+@pytest.mark.parametrize("name", list(PIDS))
+def test_a_limited_reference_follows_small_motions_as_without_limits(name):
+    """Its state sums up the changes of r, and only r(k) and r(k+1) alone move it."""
+    limited = pj.control.LimitedReference(pid(name), 1e4, DT, acceleration=1e8)
+    plain, found = (
+        pj.stability_report(around(one), 3.0) for one in (pid(name), limited)
+    )
+    assert found.stable
+    for figure in ("bandwidth_Hz", "bandwidth_1dB_Hz", "closed_loop_peak"):
+        expected = getattr(plain.following, figure)
+        assert getattr(found.following, figure) == pytest.approx(expected, rel=1e-6)
+
+
 def test_a_loop_that_does_not_follow_has_no_bandwidth():
     report = pj.stability_report(around(pj.control.PID(0.5, 0.0, dt=DT)), 0.0)
     assert report.following.bandwidth_Hz == 0.0

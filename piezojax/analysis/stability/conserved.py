@@ -53,15 +53,28 @@ class LinearLoop(NamedTuple):
 class FollowedReference(NamedTuple):
     """Closed loop of one axis from its reference to the displacement, as matrices.
 
-    A [n, n], B [n, 2] for r(k) and r(k+1), C [n] for y(k); ``dt`` in s. ``conserved``
-    is the number of conserved modes that have been removed.
+    A [n, n], B [n] for r(k), C [n] and D for y(k); ``dt`` in s. ``conserved`` is the
+    number of conserved modes that have been removed.
     """
 
     A: np.ndarray
     B: np.ndarray
     C: np.ndarray
+    D: float
     dt: float
     conserved: int = 0
+
+    @classmethod
+    def seen_ahead(
+        cls, A: np.ndarray, B: np.ndarray, C: np.ndarray, dt: float
+    ) -> "FollowedReference":
+        """Return the loop of a controller that sees r(k) and r(k+1), B [n, 2].
+
+        With the states less B r(k), r(k) alone moves the loop. A state that sums up
+        the changes of the reference (``LimitedReference``) is then conserved.
+        """
+        now, following = B.T
+        return cls(A, now + A @ following, C, float(C @ following), dt)
 
     def closed(self) -> np.ndarray:
         """Return the state matrix, which is that of the closed loop."""
@@ -69,9 +82,8 @@ class FollowedReference(NamedTuple):
 
     def response(self, angle: np.ndarray) -> np.ndarray:
         """Return y/r [m] at z = exp(i angle), angle [m] in rad/sample."""
-        z = np.exp(1j * np.atleast_1d(angle))
-        each = _transfer(self.A, self.B, self.C[None], angle)[:, 0]
-        return each[:, 0] + z * each[:, 1]
+        found = _transfer(self.A, self.B[:, None], self.C[None], angle)
+        return found[:, 0, 0] + self.D
 
 
 class LinearAxes(NamedTuple):
@@ -138,7 +150,7 @@ def without_conserved(loop: Matrices) -> Matrices:
     operating point and not its stability. They span the left null space of [A - I, B].
     All other modes stay, including uncontrollable and unobservable ones.
     """
-    A, B, C, dt, *_ = loop
+    A, B, C = loop.A, loop.B, loop.C
     rows = np.hstack([A - np.eye(len(A)), B.reshape(len(A), -1)])
     length = _lengths(rows)
     left, singular, _ = np.linalg.svd(rows / length[:, None], full_matrices=True)
@@ -150,12 +162,11 @@ def without_conserved(loop: Matrices) -> Matrices:
     order = linalg.qr(kept_sum.T, mode="economic", pivoting=True)[-1]
     out, stay = np.sort(order[:count]), np.sort(order[count:])
     back = -np.linalg.solve(kept_sum[out].T, kept_sum[stay].T)
-    return type(loop)(
-        A[np.ix_(stay, stay)] + A[np.ix_(stay, out)] @ back,
-        B[stay],
-        C[..., stay] + C[..., out] @ back,
-        dt,
-        count,
+    return loop._replace(
+        A=A[np.ix_(stay, stay)] + A[np.ix_(stay, out)] @ back,
+        B=B[stay],
+        C=C[..., stay] + C[..., out] @ back,
+        conserved=count,
     )
 
 

@@ -140,7 +140,7 @@ def linear_loop(loop: Feedback, at: Any = 0.0) -> tuple[LinearLoop, LoopState]:
     # The voltage that the actuator returns closes the loop: u = -(C x + D r).
     closed = A - np.outer(B[:, 0], C[0])
     driven = B[:, 1:] - np.outer(B[:, 0], D[0, 1:])
-    followed = balanced(FollowedReference(closed, driven, C[1], dt))
+    followed = balanced(FollowedReference.seen_ahead(closed, driven, C[1], dt))
     return cut._replace(followed=without_conserved(followed)), start
 
 
