@@ -235,7 +235,10 @@ def response_table(found: Mapping[str, MeasuredMargins]) -> Table:
 
 
 def following_table(stability: StabilityReports) -> Table:
-    """Return the table of the closed-loop response of each loop of one axis."""
+    """Return the table of the closed-loop response of each loop of one axis.
+
+    A dash stands for a response that does not settle although the loop is stable.
+    """
     table = Table(title="small motions of the reference, worse branch")
     table.add_column("loop")
     for title in ("bandwidth, -3 dB", "-1 dB", "closed-loop peak"):
@@ -244,7 +247,8 @@ def following_table(stability: StabilityReports) -> Table:
         shown = "tuned" if name == "after" else name
         each = [report.following for report in branches.values()]
         if any(one is None for one in each):
-            table.add_row(shown, *_UNSTABLE[:3])
+            stable = all(report.stable for report in branches.values())
+            table.add_row(shown, *(("-",) * 3 if stable else _UNSTABLE[:3]))
             continue
         least, inner = (
             min(getattr(one, field) for one in each)

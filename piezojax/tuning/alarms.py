@@ -224,12 +224,17 @@ def _misses(name: str, value: float | None, limit: float) -> bool:
 def _not_exact(
     limits: Mapping[str, ConstraintOutcome], stability: StabilityReports
 ) -> dict[str, ConstraintOutcome]:
-    """Return the outcomes that the exact margins of the nominal plant do not cover."""
-    exact = {} if "after" in stability.problems else _EXACT_FIGURES
+    """Return the outcomes that the exact figures of the nominal plant do not cover.
+
+    An unstable loop has an alarm of its own, and none of its figures matters.
+    """
+    found = exact_figures(stability).values()
+    exact = [set(_EXACT_FIGURES if figures is None else figures) for figures in found]
+    covered = set.intersection(*exact) if exact else set()
     return {
         name: outcome
         for name, outcome in limits.items()
-        if outcome.of > 1 or name not in exact
+        if outcome.of > 1 or name not in covered
     }
 
 

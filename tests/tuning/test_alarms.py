@@ -16,6 +16,7 @@ from piezojax.analysis.stability.conserved import LinearAxes, LinearLoop
 from piezojax.analysis.stability.following import Following
 from piezojax.cli.tune import main
 from piezojax.core.files import write_json
+from piezojax.report.tuning_tables import following_table
 from piezojax.tuning.alarms import DISAGREE, alarms_of, exact_peak
 from piezojax.tuning.result import ConstraintOutcome, Perturbed, Result, Scores
 from piezojax.tuning.step_tests import StepResult
@@ -254,6 +255,30 @@ def test_following_the_reference_is_checked_exactly(name, limit, held):
     stability = StabilityReports(reports={"after": {"ascending": report}})
     found = alarms(stability=stability, limits={name: limit})
     assert [alarm.partition(" ")[0] for alarm in found] == [name] * (not held)
+
+
+def test_a_response_that_is_not_known_leaves_the_outcome_of_the_search():
+    """A mode that does not decay hides y/r, not the limits on it."""
+    known = replace(
+        report_of(integrator(0.1)), following=Following(400.0, 200.0, 1.2, 350.0)
+    )
+    unknown = report_of(integrator(0.1))
+    assert unknown.stable and unknown.following is None
+    limits = {"bandwidth": 300.0, "closed_loop_peak": 1.5}
+    missed = {
+        "bandwidth": outcome("bandwidth", [250.0], 300.0),
+        "closed_loop_peak": outcome("closed_loop_peak", [1.9], 1.5),
+    }
+    for branches, count in (((unknown,), 2), ((known, unknown), 2), ((known,), 0)):
+        named = dict(zip(("ascending", "descending"), branches, strict=False))
+        stability = StabilityReports(reports={"after": named})
+        found = alarms(changed(constraints=missed), stability, limits)
+        assert len(found) == count
+        shown = "".join(following_table(stability).columns[1].cells)
+        assert shown == ("-" if unknown in branches else "400 Hz")
+    (alarm,) = alarms(changed(constraints=missed), reports(2.0), limits)
+    assert "unstable for small motions" in alarm
+    assert [*following_table(reports(2.0)).columns[1].cells] == ["unstable"]
 
 
 def test_lower_limits_are_violated_from_below():
