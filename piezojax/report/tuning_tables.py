@@ -189,18 +189,22 @@ def stability_table(stability: StabilityReports) -> Table:
         table.add_row(shown, *_margins(list(branches.values())))
     for name, axes in stability.axes.items():
         shown = "tuned" if name == "after" else name
-        if not axes.report.stable:
+        branches = axes.reports
+        if not all(report.stable for report in branches):
             table.add_row(shown, *_UNSTABLE)
-        for axis, report in zip(stability.axis_names, axes.report.axes, strict=False):
-            table.add_row(f"{shown}, {axis}", *_margins([report]))
-        if axes.report.disk_margin is not None:
-            table.add_row(
-                f"{shown}, all axes at once",
-                f"{axes.report.largest_sensitivity_peak:.2f}",
-                f"{20.0 * math.log10(axes.report.disk_gain_margin or 1.0):.1f} dB",
-                f"{axes.report.disk_phase_margin_deg:.1f}°",
-                "-",
-            )
+            continue
+        for axis, at in enumerate(stability.axis_names):
+            each = [report.axes[axis] for report in branches]
+            table.add_row(f"{shown}, {at}", *_margins(each))
+        least = axes.report  # the branch with the smaller disk margin
+        peak = max(report.largest_sensitivity_peak or 0.0 for report in branches)
+        table.add_row(
+            f"{shown}, all axes at once",
+            f"{peak:.2f}",
+            f"{20.0 * math.log10(least.disk_gain_margin or 1.0):.1f} dB",
+            f"{least.disk_phase_margin_deg:.1f}°",
+            "-",
+        )
     for name in stability.problems:
         table.add_row("tuned" if name == "after" else name, "-", "-", "-", "-")
     return table

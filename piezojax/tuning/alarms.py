@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ..analysis.constraints import CONSTRAINTS
-from ..analysis.stability import StabilityReport, StabilityReports
+from ..analysis.stability import MultiAxisReport, StabilityReport, StabilityReports
 from ..analysis.step_response import LARGE
 from .objective import RAILED
 from .result import ConstraintOutcome, Perturbed, Result, Scores
@@ -167,17 +167,36 @@ def exact_figures(
 ) -> dict[str, dict[str, float | None] | None]:
     """Return the exact figures of the tuned loop, None where it is unstable.
 
-    On one axis the keys name the branch; on several the only key is "".
+    On one axis the keys name the branch; on several the only key is "", with the worst
+    of each figure over both branches.
     """
     found: dict[str, dict[str, float | None] | None] = {}
     for branch, report in stability.reports.get("after", {}).items():
         found[f" on the {branch} branch"] = _figures(report, [report])
     if "after" in stability.axes:
-        report = stability.axes["after"].report
-        found[""] = _figures(report, report.axes)
-        if found[""] is not None:
-            found[""][PEAK] = report.largest_sensitivity_peak
+        found[""] = _worst([_axes_figures(r) for r in stability.axes["after"].reports])
     return found
+
+
+def _axes_figures(report: MultiAxisReport) -> dict[str, float | None] | None:
+    figures = _figures(report, report.axes)
+    return figures and figures | {PEAK: report.largest_sensitivity_peak}
+
+
+def _worst(
+    branches: Sequence[dict[str, float | None] | None],
+) -> dict[str, float | None] | None:
+    """Return the worst of each figure over ``branches``, None if one is unstable."""
+    known = [figures for figures in branches if figures is not None]
+    if len(known) < len(branches):
+        return None
+
+    def worst(name: str) -> float:
+        pick = np.max if CONSTRAINTS[name].sense == "at most" else np.min
+        # A figure that is not known becomes NaN, which no limit accepts.
+        return float(pick(np.array([figures[name] for figures in known], float)))
+
+    return {name: worst(name) for name in known[0]}
 
 
 def exact_peak(stability: StabilityReports) -> float:

@@ -424,7 +424,7 @@ def test_branches_that_differ_by_rounding_share_their_curves():
     assert list(reports.curves("after", 3.0)) == ["ascending"]
 
 
-def test_the_worse_branch_of_several_axes_is_reported():
+def test_both_branches_of_several_axes_are_reported():
     """Plays of negative weight: the stage moves more on the descending branch."""
     one = around(pid("hard"))
     play = pj.hysteresis.PrandtlIshlinskii((SLOPE,), (1.0,), (-0.2 * SLOPE,))
@@ -436,6 +436,11 @@ def test_the_worse_branch_of_several_axes_is_reported():
     ).axes.values()
     expected = pj.stability_report(around(pid("hard")))
     assert found.report.disk_margin == pytest.approx(expected.disk_margin, rel=1e-6)
+    assert found.report.branch == "descending"
+    # The slope of the ascending branch is 0.8 SLOPE.
+    expected = pj.stability_report(around(pid("hard"), 0.8))
+    assert found.other.disk_margin == pytest.approx(expected.disk_margin, rel=1e-6)
+    assert found.other.branch == "ascending"
 
 
 def test_phase_lead_at_both_crossovers():

@@ -16,7 +16,7 @@ from piezojax.analysis.stability.conserved import LinearAxes, LinearLoop
 from piezojax.analysis.stability.following import Following
 from piezojax.cli.tune import main
 from piezojax.core.files import write_json
-from piezojax.report.tuning_tables import following_table
+from piezojax.report.tuning_tables import following_table, stability_table
 from piezojax.tuning.alarms import DISAGREE, alarms_of, exact_peak
 from piezojax.tuning.result import ConstraintOutcome, Perturbed, Result, Scores
 from piezojax.tuning.step_tests import StepResult
@@ -338,6 +338,43 @@ def test_the_cut_at_the_displacements_is_checked_on_several_axes():
     axes = AxesStability(report, before)
     (alarm,) = alarms(stability=StabilityReports(axes={"after": axes}))
     assert alarm.startswith(f"sensitivity_peak is {peaks[1]:.3g} on the nominal plant,")
+
+
+def test_the_worst_margins_of_both_branches_are_checked_on_several_axes():
+    """The branch with the larger disk margin has the smaller delay margin."""
+    cuts = [
+        LinearAxes(loop.A, loop.B[:, None], loop.C[None], loop.dt)
+        for loop in (integrator(0.28), integrator(0.45, delay=1))
+    ]
+    found = [axes_report_of(cut) for cut in cuts]
+    low, high = (report.axes[0] for report in found)
+    assert low.disk_margin < high.disk_margin
+    assert high.delay_margin_samples < 2.8 < low.delay_margin_samples
+    both = AxesStability(found[0], cuts[0], found[1])
+    stability = StabilityReports(axes={"after": both}, axis_names=("X",))
+    # The search found the same, but the exact figures replace its outcome.
+    missed = {"delay_margin": outcome("delay_margin", [2.0], 2.8)}
+    limits = {
+        "sensitivity_peak": 1.01 * low.sensitivity_peak,
+        "disk_margin": 0.99 * low.disk_margin,
+        "delay_margin": 2.8,
+    }
+    (alarm,) = alarms(changed(constraints=missed), stability, limits)
+    margin = f"{high.delay_margin_samples:.3g} samples"
+    assert alarm.startswith(f"delay_margin is {margin} on the nominal plant, below")
+    shown = [*stability_table(stability).columns[4].cells]
+    assert shown == [f"{high.delay_margin_samples:.2f} samples", "-"]
+    peak, largest = [*stability_table(stability).columns[1].cells]
+    assert peak == largest == f"{low.sensitivity_peak:.2f}"
+    figures = stability.as_dict()["after"]
+    assert figures["disk_margin"] == found[0].disk_margin
+    assert figures["other_branch"]["disk_margin"] == found[1].disk_margin
+    # An unstable branch is worse than any margin.
+    lost = axes_report_of(LinearAxes(2.0 * np.eye(1), *np.ones((2, 1, 1)), 1e-4, 0))
+    assert not lost.stable
+    unstable = StabilityReports(axes={"after": AxesStability(lost, cuts[0], found[1])})
+    (alarm,) = alarms(changed(constraints=missed), unstable, limits)
+    assert alarm.startswith("the tuned loop is unstable for small motions:")
 
 
 def test_a_margin_of_nan_is_an_alarm():

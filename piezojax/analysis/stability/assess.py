@@ -85,10 +85,26 @@ class AxesCurves(NamedTuple):
 
 @dataclass(frozen=True)
 class AxesStability:
-    """Report and linear loop of several axes, on one branch of the hysteresis."""
+    """Stability of a loop of several axes.
+
+    ``report`` and ``loop`` are those on the branch of the hysteresis with the smaller
+    disk margin. ``other`` is the report on the other branch, whose other margins may be
+    smaller; None if only one branch is known.
+    """
 
     report: MultiAxisReport
     loop: LinearAxes
+    other: MultiAxisReport | None = None
+
+    @property
+    def reports(self) -> list[MultiAxisReport]:
+        """Reports on the known branches."""
+        return [one for one in (self.report, self.other) if one is not None]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON: those of ``report``, and ``other_branch``."""
+        other = self.other and self.other.as_dict()
+        return self.report.as_dict() | {"other_branch": other}
 
     def curves(self) -> AxesCurves:
         """Return the magnitudes of the sensitivities against frequency."""
@@ -144,14 +160,14 @@ class StabilityReports:
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON, by name.
 
-        Each value holds the reports of one axis by branch, the report of several axes,
-        or a ``problem``.
+        Each value holds the reports of one axis by branch, those of several axes, or a
+        ``problem``.
         """
         found: dict[str, Any] = {
             name: {branch: report.as_dict() for branch, report in reports.items()}
             for name, reports in self.reports.items()
         }
-        found |= {n: one.report.as_dict() for n, one in self.axes.items()}
+        found |= {name: one.as_dict() for name, one in self.axes.items()}
         return found | {n: {"problem": why} for n, why in self.problems.items()}
 
     def curves(self, name: str, decades: float) -> dict[str, LoopCurves]:
@@ -190,10 +206,9 @@ def stability_reports(
     """Return the stability of ``loops``, by name, on both branches at ``reference``.
 
     ``reference`` in um, ``dt`` in s. With ``axis_names`` the reference holds one number
-    for each axis, and only the branch with the smaller disk margin is reported. On one
-    axis the reports at ``other``, if it is another reference, have the names of their
-    branches and of this reference. A loop that cannot be linearised is listed in
-    ``problems``; its error is not raised.
+    for each axis. On one axis the reports at ``other``, if it is another reference,
+    have the names of their branches and of this reference. A loop that cannot be
+    linearised is listed in ``problems``; its error is not raised.
     """
     result = StabilityReports(axis_names=axis_names)
     points = {branch: OperatingPoint(reference, branch, dt=dt) for branch in BRANCHES}
@@ -205,7 +220,7 @@ def stability_reports(
     for name, loop in loops.items():
         try:
             if axis_names:
-                result.axes[name] = _worse_branch(loop, [*points.values()])
+                result.axes[name] = _both_branches(loop, [*points.values()])
                 continue
             found = {at: linear_loop(loop, point) for at, point in points.items()}
             result.reports[name] = {
@@ -219,9 +234,12 @@ def stability_reports(
     return result
 
 
-def _worse_branch(loop: Feedback, points: Sequence[OperatingPoint]) -> AxesStability:
-    found = [_axes_stability(loop, point) for point in points]
-    return min(found, key=lambda one: one.report.disk_margin or 0.0)
+def _both_branches(loop: Feedback, points: Sequence[OperatingPoint]) -> AxesStability:
+    worse, other = sorted(
+        (_axes_stability(loop, point) for point in points),
+        key=lambda one: one.report.disk_margin or 0.0,
+    )
+    return dataclasses.replace(worse, other=other.report)
 
 
 def _axes_stability(loop: Feedback, point: OperatingPoint) -> AxesStability:
