@@ -31,6 +31,7 @@ from piezojax.analysis.stability import OperatingPoint
 from piezojax.cli.command import results_folder
 from piezojax.cli.reproduce import NAMES
 from piezojax.cli.terminal import Bar, console
+from piezojax.core.paths import replace
 from piezojax.core.registry import parts
 from piezojax.identification.chain import DEFAULT
 from piezojax.identification.estimators.estimate import Options
@@ -286,6 +287,19 @@ def test_export_writes_the_tuned_controller_with_its_limits(tuned, tmp_path):
     references = pj.read_about(tuned[1] / "gains.toml").reference_ranges[0]
     assert columns[0].min() < references[0]
     assert columns[0].max() > references[1]
+
+
+def test_export_of_a_loop_that_diverges_ends_with_status_3(tuned, tmp_path):
+    """The gains were changed by hand, and no limit of the voltage bounds them."""
+    (tmp_path / "study.toml").write_bytes((tuned[1] / "study.toml").read_bytes())
+    path, tuned_gains = tmp_path / "gains.toml", tuned[1] / "gains.toml"
+    loose = replace(pj.load(tuned_gains), {"proportional": 1e6})
+    pj.save(loose, path, pj.read_about(tuned_gains))
+    out, limits = tmp_path / "c", ("--limits", "-1e300", "1e300")
+    result = call("export", path, "--out", out, *limits)
+    assert result.exit_code == 3
+    assert "ALARM: the compiled controller diverges in the simulat" in result.stdout
+    assert "report.html" in names(out)
 
 
 def test_export_beside_another_study_is_not_judged(tuned, tmp_path):

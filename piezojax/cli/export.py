@@ -8,7 +8,7 @@ import click
 from rich.console import Console
 
 from ..core.files import numbered_folder
-from .command import RESULTS, Command, common, print_results, run
+from .command import RESULTS, Command, common, exit_unsafe, print_results, run
 from .tune import study_path
 
 if TYPE_CHECKING:
@@ -79,11 +79,11 @@ def main(
     one of them. For C, `make test` in the new folder compiles the source and replays a
     simulation. A controller in C is also compiled here and judged in the simulated loop
     of its study; report.json has its errors in double and float, and the time of a
-    step.
+    step. If this loop diverges, the files begin with an alarm, and the exit status is 3.
     """
 
     def body(console):
-        export_file(
+        alarms = export_file(
             source,
             console,
             to=to,
@@ -96,6 +96,7 @@ def main(
             out=out,
             seed=seed or 0,
         )
+        exit_unsafe(alarms)
 
     run(quiet, body)
 
@@ -114,10 +115,11 @@ def export_file(
     out: Path | None = None,
     seed: int = 0,
     runs: "Runs | None" = None,
-) -> None:
+) -> list[str]:
     """Export the System in the file or folder ``source`` and print the result.
 
-    ``runs`` are the runs of the study, which judge a controller in C; by default they
+    Return the alarms of the exported controller in the simulated loop; those of its
+    file are refused, or accepted by ``accept_unsafe``. ``runs`` are the runs of the study, which judge a controller in C; by default they
     are computed from the file of the study. The other arguments are the options of the
     command.
     """
@@ -166,18 +168,22 @@ def export_file(
     parts: "list[Table | str]" = [f"{file}" for file in files]
     if to == "vendor":
         parts.append(device_table(device_values(system, before)))
+    alarms: list[str] = []
     if runs is not None:
-        parts += judgement(read_model(ExportReport, folder / REPORT, "is no report"))
+        report = read_model(ExportReport, folder / REPORT, "is no report")
+        alarms = report.alarms
+        parts += judgement(report)
     if to == "c":
         parts.append(f"test: make -C {folder} test")
     page = Page(
         f"{type(system).__name__} of {path.name}, exported as {to}",
-        export_alarms(system, about),
+        [*export_alarms(system, about), *alarms],
         parts,
         about.origin("A System"),
     )
     write_page(page, folder)
     print_results(page, folder, console)
+    return alarms
 
 
 def _runs(

@@ -81,7 +81,8 @@ def export(
     ``precision`` is "double", "float", or "compensated": float whose sums carry their
     rounding errors. With ``runs`` (``piezojax.tuning.exported_runs.make_runs``), a
     controller in C is also compiled and judged in the simulated loop. The last path is
-    then the report, and "float" becomes "compensated" if float costs too much.
+    then the report, and "float" becomes "compensated" if float costs too much. If the
+    compiled loop diverges, the files begin with this alarm, which the report has, too.
 
     Raises ValueError for a ``folder`` in use, an unknown ``to``, a System with alarms
     (``about.unsafe``) or a controller without margins (``about.judged``) unless
@@ -128,6 +129,7 @@ def export(
     if runs is not None and isinstance(system, Driven):
         report = judge(system, interface, runs, precision)
         precision = report.written
+        about = about.model_copy(update={"unsafe": [*about.unsafe, *report.alarms]})
     folder = Path(folder)
     files = write_c(system, interface, inputs, folder, name, about, precision)
     if report is not None:

@@ -46,7 +46,8 @@ class ExportReport(BaseModel):
     """Report on an exported controller; ``written`` is its precision.
 
     ``why`` is the reason if ``written`` differs from the requested precision, and
-    ``not_judged`` the reason if there are no figures.
+    ``not_judged`` the reason if there are no figures. ``alarms`` are the reasons not to
+    use the exported controller.
     """
 
     model_config = ConfigDict(ser_json_inf_nan="strings")
@@ -54,6 +55,7 @@ class ExportReport(BaseModel):
     written: str
     why: str | None = None
     not_judged: str | None = None
+    alarms: list[str] = []
     warnings: list[str] = []
     forms: dict[str, FormFigures] = {}
     references: dict[str, ReferenceCost] = {}
@@ -67,6 +69,14 @@ class ExportReport(BaseModel):
             if not cost.percent[precision] <= WORST_PERCENT  # NaN is costly
         ]
 
+    def lost(self, precision: str) -> list[str]:
+        """Return the references under which the loop diverges in ``precision``."""
+        return [
+            name
+            for name, cost in self.references.items()
+            if not np.isfinite(cost.rms[precision])
+        ]
+
 
 def judge(
     system: System, interface: Interface, runs: Runs, precision: str = "double"
@@ -74,14 +84,22 @@ def judge(
     """Return the report on ``system``, compiled in double and float, over ``runs``.
 
     If ``precision`` is "float" and float costs more than ``WORST_PERCENT`` of the error
-    under a reference, ``written`` is "compensated".
+    under a reference, ``written`` is "compensated". A loop that diverges, in double or
+    in the written precision, is an alarm.
     """
     report = ExportReport(written=precision)
     try:
         loop = CompiledLoop(runs)
         exact = _add(report, "double", system, interface, loop, runs)
-        if not np.isfinite(exact.displacements).all():
-            raise ValueError("the loop diverges")
+        if not np.isfinite(exact.displacements).all() or report.lost("double"):
+            return ExportReport(
+                written=precision,
+                not_judged="the loop diverges",
+                alarms=[
+                    "the compiled controller diverges in the simulated loop of its "
+                    "study: tune it again, or check the limits of the voltage"
+                ],
+            )
         _add(report, "float", system, interface, loop, runs, exact)
         if precision == "float" and (costly := report.costly("float")):
             report.written, report.why = "compensated", "; ".join(costly)
@@ -89,7 +107,14 @@ def judge(
             _add(report, "compensated", system, interface, loop, runs, exact)
     except ValueError as error:
         return ExportReport(written=precision, not_judged=str(error))
-    if report.written != "double":
+    if report.written == "double":
+        return report
+    if lost := report.lost(report.written):
+        report.alarms = [
+            f"the compiled controller diverges in {report.written} under "
+            f"{', '.join(lost)}: use double"
+        ]
+    else:
         costly = report.costly(report.written)
         report.warnings = [f"{each}: use double" for each in costly]
     return report
@@ -136,4 +161,5 @@ def _rms(errors: Any) -> float:
 
     It is that of the worst run, as in the result of tuning.
     """
-    return 1e3 * float(np.sqrt(np.mean(np.square(errors), axis=1).max()))
+    with np.errstate(over="ignore"):  # a loop that diverges has an infinite RMS
+        return 1e3 * float(np.sqrt(np.mean(np.square(errors), axis=1).max()))

@@ -1,6 +1,7 @@
 """Exported controllers in the simulated loop: costs of float and compensated sums."""
 
 import dataclasses
+import io
 import subprocess
 from collections.abc import Callable
 
@@ -10,10 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from exported_folders import compiled
+from rich.console import Console
 
 import piezojax as pj
 from piezojax import study as studies
 from piezojax.catalog import CONTROLLERS
+from piezojax.cli.export import export_file
 from piezojax.core.files import read_model
 from piezojax.core.parameter import parameter
 from piezojax.core.system import Affine
@@ -22,6 +25,7 @@ from piezojax.exporting.c_project import CProject
 from piezojax.exporting.compiled_loop import CompiledLoop, Runs, RunTrace
 from piezojax.exporting.judge import ExportReport, judge
 from piezojax.exporting.slots import Interface
+from piezojax.report.export_tables import judgement
 from piezojax.tuning.data import make_data
 from piezojax.tuning.exported_runs import holdout_of, make_runs
 from piezojax.tuning.runs import evaluate
@@ -183,6 +187,48 @@ def test_a_loop_that_diverges_is_not_judged():
     system = Driven(Integral(count=lambda x, more: jnp.nan * x), pj.Saturation(*LIMITS))
     report = judge(system, interface_of(), slow_runs(), "float")
     assert report.not_judged == "the loop diverges"
+    (alarm,) = report.alarms
+    assert alarm.startswith("the compiled controller diverges in the simulated loop")
+    assert judgement(report)[0].startswith("note: not judged")
+
+
+OVERFLOWS = Integral(count=lambda x, more: x + more + jnp.exp(100.0 + more) * 1e-60)
+"""Exp(100) overflows in float, and adds 3e-17 V in double."""
+
+
+@pytest.mark.parametrize("precision", ["double", "float", "compensated"])
+def test_a_precision_in_which_the_loop_diverges_has_an_alarm(precision):
+    system = Driven(OVERFLOWS, pj.Saturation(*LIMITS))
+    report = judge(system, interface_of(), slow_runs(), precision)
+    assert np.isfinite(report.references["STEP"].rms["double"])
+    assert report.warnings == []
+    if precision == "double":
+        assert report.alarms == []
+        return
+    (alarm,) = report.alarms
+    assert alarm == (
+        "the compiled controller diverges in compensated under STEP: use double"
+    )
+
+
+def test_a_diverging_controller_is_exported_with_its_alarm(tmp_path):
+    """Its gains are far too high, and no limit of the voltage bounds them."""
+    path = tmp_path / "gains.toml"
+    about = pj.About(judged=["not here"], reference_ranges=[(0.0, 10.0)])
+    pj.save(pj.control.PID(1e6, 1.0, dt=1e-3), path, about)
+    printed = io.StringIO()
+    alarms = export_file(
+        path,
+        Console(file=printed, width=200),
+        limits=[(-1e300, 1e300)],
+        out=tmp_path / "c",
+        runs=slow_runs(),
+    )
+    (alarm,) = alarms
+    assert f"ALARM: {alarm}" in printed.getvalue()
+    for name in ("controller.c", "controller.h", "report.html", "report.json"):
+        assert alarm in (tmp_path / "c" / name).read_text(encoding="utf-8")
+    assert "UNSAFE: the compiled" in (tmp_path / "c" / "controller.c").read_text()
 
 
 @pytest.mark.parametrize("name", ["mirror", "p753_learned_inverse"])
