@@ -14,6 +14,8 @@ from oracles import excitation, forty_stages
 from piezojax import About, save
 from piezojax.cli import start
 from piezojax.control import PID
+from piezojax.core.files import write_report
+from piezojax.exporting.judge import ExportReport
 from piezojax.identification import Record, read_record
 from piezojax.identification.records.recognise import noise_rms, recognised
 from piezojax.identification.records.response import FrequencyResponse
@@ -470,6 +472,7 @@ class Verbs:
 
     def __init__(self, **result):
         self.calls, self.found = [], result
+        self.exported = result.pop("exported", [])
 
     def tune(self, study, out, seed, baselines, console, *, sliders):
         assert sliders  # the default of the command
@@ -483,12 +486,17 @@ class Verbs:
         contents = contents_of(known, study.parent)
         about = About(study_sha256=sha256_of(known, contents))
         save(PID(0.1, 1.0, dt=1e-3), out / "gains.toml", about)
+        (out / "report.html").touch()
         return SimpleNamespace(result=result, case=None, holdout=None)
 
     def export(self, source, console, *, to, study, out, runs):
         self.calls.append(("export", source.name, to))
         out.mkdir()
         (out / "Makefile").touch()
+        report = ExportReport(written="double", alarms=self.exported)
+        write_report(out / "report.json", report)
+        (out / "report.html").touch()
+        return self.exported
 
 
 @pytest.fixture
@@ -603,6 +611,41 @@ def test_an_interrupted_start_goes_on(run, tmp_path):
     assert (status, calls) == (0, [])
     assert "tuned before: the gains are in" in output
     assert "exported before:" in output
+
+
+@pytest.mark.parametrize("lost", ["report.html", "gains.toml", "result.json"])
+def test_a_killed_search_is_tuned_again(run, tmp_path, lost):
+    """Its page, which is written last, is missing, and maybe its numbers, too."""
+    run("--yes", alarms=["it rings"])
+    for name in {lost, "report.html"}:
+        (tmp_path / "out" / "tuned" / name).unlink()
+    status, output, calls = run("--yes")
+    assert (status, calls) == (0, [("tune", "tuned-2"), ("export", "tuned-2", "c")])
+    page = tmp_path / "out" / "tuned-2" / "report.html"
+    assert f"page with the results: {page}\n" in output
+    status, output, calls = run("--yes")
+    assert (status, calls) == (0, [])
+    assert f"exported before: {tmp_path / 'out' / 'controller-2'}\n" in output
+
+
+def test_a_killed_export_is_exported_again(run, tmp_path):
+    run("--yes")
+    (tmp_path / "out" / "controller" / "report.html").unlink()
+    status, output, calls = run("--yes")
+    assert (status, calls) == (0, [("export", "tuned", "c")])
+    assert "exported before" not in output
+    assert (tmp_path / "out" / "controller" / "report.html").is_file()
+    assert (tmp_path / "out" / "controller-unfinished" / "Makefile").is_file()
+
+
+def test_alarms_of_an_export_are_printed_again(run, tmp_path):
+    alarm = "the compiled controller diverges"
+    status, output, _ = run("--yes", exported=[alarm])
+    assert status == 3
+    assert "done: gains and pictures in" in output
+    status, output, calls = run("--yes")
+    assert (status, calls) == (3, [])
+    assert f"ALARM: {alarm}" in output
 
 
 def test_a_changed_study_is_tuned_again(run, tmp_path):

@@ -9,7 +9,15 @@ import click
 from rich.console import Console
 
 from ..core.files import numbered_folder, write_text
-from .command import RESULTS, Command, common, print_alarms, print_loading, run
+from .command import (
+    RESULTS,
+    Command,
+    common,
+    exit_unsafe,
+    print_alarms,
+    print_loading,
+    run,
+)
 from .export import export_file
 from .questions import QUESTIONS, asked, concerns, option, questions
 from .records import columns_of, recognised_columns
@@ -104,7 +112,7 @@ def main(record, response, yes, sliders, out, quiet, **given):
             except KeyboardInterrupt:
                 console.print(_going_on(record, folder), soft_wrap=True)
                 raise
-        result = outcome.result if outcome else load_result(tuned)
+        result, alarms = outcome.result if outcome else load_result(tuned), []
         if result.status == INTERRUPTED:
             console.print(_going_on(record, folder), soft_wrap=True)
             finish(result)
@@ -118,9 +126,10 @@ def main(record, response, yes, sliders, out, quiet, **given):
                 soft_wrap=True,
             )
         else:
-            _export(folder, tuned, outcome, console)
+            alarms = _export(folder, tuned, outcome, console)
         console.print(f"page with the results: {tuned / PAGE}", soft_wrap=True)
         finish(result)
+        exit_unsafe(alarms)
 
     run(quiet, body)
 
@@ -263,16 +272,20 @@ def _check_same(
 def _finished(study: Path, console: Console) -> Path | None:
     """Return the newest folder of gains of a finished search on ``study``, or None.
 
-    Gains of an earlier version of the study or of its record do not count.
+    Gains of an earlier version of the study or of its record do not count, nor does a
+    folder without its page, which is written last.
     """
     from ..core.serial import read_about
+    from ..report.page import PAGE
     from ..study import contents_of, load, sha256_of
     from ..tuning.result import GAINS_FILE, RESULT_FILE, load_result
 
     known, found = load(study), []
     wanted = sha256_of(known, contents_of(known, study.parent))
-    for file in study.parent.glob(f"{TUNED}*/{RESULT_FILE}"):
-        folder = file.parent
+    for folder in study.parent.glob(f"{TUNED}*"):
+        files = GAINS_FILE, RESULT_FILE, PAGE
+        if not all((folder / file).is_file() for file in files):
+            continue
         if load_result(folder).status == INTERRUPTED:
             continue
         if read_about(folder / GAINS_FILE).study_sha256 == wanted:
@@ -292,11 +305,14 @@ def _going_on(record: Path, folder: Path) -> str:
 
 def _export(
     folder: Path, tuned: Path, outcome: "Outcome | None", console: Console
-) -> None:
+) -> list[str]:
     """Export the gains in ``tuned``, unless they are exported already.
 
-    Gains of a device are written in its file format, all others as C code.
+    Gains of a device are written in its file format, all others as C code. Return the
+    alarms of the exported controller. A folder without its page, which is written last,
+    is of a killed run: it is renamed.
     """
+    from ..report.page import PAGE
     from ..study import load
     from ..study.first_plan import DEVICES
     from ..tuning.exported_runs import make_runs
@@ -304,11 +320,16 @@ def _export(
     device = load(folder / STUDY).controller.get("design") in DEVICES
     # The gains in tuned-2 go to controller-2.
     exported = folder / tuned.name.replace(TUNED, EXPORTED, 1)
-    if exported.is_dir() and any(exported.iterdir()):
+    if (exported / PAGE).is_file():
+        alarms = _export_alarms(exported)
+        print_alarms(console, alarms)
         console.print(f"exported before: {exported}", soft_wrap=True)
-        return
-    exported = numbered_folder(exported)
-    export_file(
+        return alarms
+    if exported.is_dir() and any(exported.iterdir()):
+        exported.rename(
+            numbered_folder(exported.with_name(f"{exported.name}-unfinished"))
+        )
+    alarms = export_file(
         tuned,
         console,
         to="vendor" if device else "c",
@@ -321,3 +342,15 @@ def _export(
         f"{exported}, the study in {folder / STUDY}",
         soft_wrap=True,
     )
+    return alarms
+
+
+def _export_alarms(exported: Path) -> list[str]:
+    """Return the alarms in the report of the ``exported`` folder, if it has one."""
+    from ..core.files import read_model
+    from ..exporting.exporter import REPORT
+    from ..exporting.judge import ExportReport
+
+    if not (exported / REPORT).is_file():
+        return []
+    return read_model(ExportReport, exported / REPORT, "is no report").alarms

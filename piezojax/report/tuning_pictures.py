@@ -38,7 +38,7 @@ _PERIODS = 4.0  # periods of the reference that are drawn, at the end of the run
 
 
 def write_results(outcome: Outcome, folder: Path) -> Pictures:
-    """Write result.json, gains.toml, study.toml and the pictures into ``folder``.
+    """Write gains.toml, study.toml, result.json and the pictures into ``folder``.
 
     A stage with several axes also has pictures of their coupling, and of the contours
     if the study has any. Returns the pictures.
@@ -77,15 +77,11 @@ def write_results(outcome: Outcome, folder: Path) -> Pictures:
 
 
 def write_numbers(outcome: Outcome, folder: Path) -> None:
-    """Write result.json, gains.toml and study.toml into ``folder``.
+    """Write gains.toml, study.toml and result.json into ``folder``, in this order.
 
     Relative names of files in study.toml are relative to ``folder``.
     """
     case = outcome.case
-    before, after = outcome.drive
-    found = {"drive_before": before, "drive": after}
-    result = outcome.result.model_copy(update=found)
-    write_report(folder / RESULT_FILE, result)
     save(outcome.controller, folder / GAINS_FILE, outcome.about)
 
     def moved(file: str) -> str:
@@ -93,6 +89,10 @@ def write_numbers(outcome: Outcome, folder: Path) -> None:
         return file if path.is_absolute() else seen_from(folder, case.folder / path)
 
     write_text(folder / STUDY_FILE, as_toml(case.study, moved))
+    before, after = outcome.drive
+    found = {"drive_before": before, "drive": after}
+    result = outcome.result.model_copy(update=found)
+    write_report(folder / RESULT_FILE, result)
 
 
 def _quantity(trace: Trace) -> str:
