@@ -78,6 +78,11 @@ class Parameter:
             below=self.below,
         )
 
+    def holds(self, values: np.ndarray) -> np.ndarray:
+        """Return whether each of ``values`` is within the limits."""
+        above = (values > self.above) & (values >= self.least)
+        return above & (values <= self.most) & (values < self.below)
+
 
 def parameter(
     unit: str,

@@ -198,6 +198,7 @@ def build(
             *notes_of_plant,
             *design_notes,
             *notes,
+            *(ensemble.notes if ensemble else ()),
         ),
         about,
         amplifier,

@@ -11,12 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from pydantic import BaseModel
+from scipy.special import ndtr
 
 from ..catalog import PLANTS, deviations_of
 from ..core.arrays import as_array
 from ..core.feedback import Feedback
 from ..core.files import read_model
-from ..core.paths import get, replace
+from ..core.paths import declared, get, replace
 from ..core.system import System
 from .ensemble_table import EnsembleTable
 from .make_hardware import driven
@@ -24,6 +25,9 @@ from .parameters import check_value
 from .schema import Study
 
 Part = Literal["tune", "margins", "holdout"]
+
+LEAST_INSIDE = 0.01
+"""Least probability that a normal draw is within the limits of its parameter."""
 
 
 class Stage(eqx.Module):
@@ -49,6 +53,8 @@ class Ensemble:
     ``make`` builds a catalogued plant from its deviations, whose names are
     ``arguments``; it is None if no deviation is varied. ``paths`` are the varied
     parameters of the Stage. ``errors`` maps paths in the Stage to standard errors.
+    Their draws outside the declared limits of the parameter are drawn again. ``notes``
+    name the parameters of the fit that are not drawn.
     """
 
     study: Study
@@ -57,6 +63,7 @@ class Ensemble:
     arguments: tuple[str, ...]
     paths: tuple[str, ...]
     errors: Mapping[str, float]
+    notes: tuple[str, ...] = ()
 
     def stages(self, part: Part) -> Stage | None:
         """Return the drawn stages of ``part``, stacked along a leading axis.
@@ -84,8 +91,19 @@ class Ensemble:
         draws = middles[:, None] + halves[:, None] * draws
         if self.study.axes is None:
             draws = draws[..., 0]
-        normal = normals.standard_normal((count, len(self.errors)))
+        normal = self._normal(normals, count)
         return jax.vmap(self._stage)(as_array(draws), as_array(normal))
+
+    def _normal(self, random: np.random.Generator, count: int) -> np.ndarray:
+        """Return draws [count, errors] that keep the parameters within their limits."""
+        found = random.standard_normal((count, len(self.errors)))
+        for column, (path, error) in zip(found.T, self.errors.items(), strict=True):
+            limits, value = declared(self.nominal, path), float(get(self.nominal, path))
+            if limits is None:
+                continue
+            while (lost := ~limits.holds(value + error * column)).any():
+                column[lost] = random.standard_normal(lost.sum())
+        return found
 
     def _interval(self, name: str) -> tuple[float, float]:
         """Return the centre and the half width of the interval of ``name``."""
@@ -119,7 +137,8 @@ def ensemble_of(
 
     Drawn plants stand behind the same ``amplifier`` as the nominal one. The files that
     the study names lie in ``folder``. Raises ValueError for an unknown deviation or
-    path, and for a file without standard errors.
+    path, for a file without standard errors, and for a standard error with which less
+    than ``LEAST_INSIDE`` of the draws are within the limits of the parameter.
     """
     table = study.ensemble
     if table is None:
@@ -150,12 +169,20 @@ def ensemble_of(
         key = "spread" if path in table.spread else "range"
         _check_path(nominal, path, f"ensemble.{key}")
         _check_ends(nominal, path, table, f"ensemble.{key}.{path}")
-    errors = (
+    errors, held = (
         _standard_errors(folder / table.standard_errors, nominal)
         if table.standard_errors
-        else {}
+        else ({}, [])
     )
-    return Ensemble(study, nominal, make, arguments, paths, errors)
+    held = [name for name in held if name not in paths]
+    note = (
+        f"ensemble.standard_errors: {table.standard_errors} has no standard error of "
+        f"{', '.join(held)}, which the record does not determine: all drawn plants "
+        "have the values of the fit; vary them in ensemble.spread"
+    )
+    return Ensemble(
+        study, nominal, make, arguments, paths, errors, (note,) if held else ()
+    )
 
 
 def _behind(
@@ -197,19 +224,39 @@ class _Estimates(BaseModel):
     parameters: dict[str, _Estimate]
 
 
-def _standard_errors(path: Path, nominal: Stage) -> dict[str, float]:
-    """Read the standard errors of a fit file; return them by path in the Stage."""
+def _standard_errors(path: Path, nominal: Stage) -> tuple[dict[str, float], list[str]]:
+    """Read the standard errors of a fit file.
+
+    Return them by path in the Stage, and the paths of parameters without one.
+    """
     try:
-        estimates = read_model(_Estimates, path, "is not a fit file")
+        estimates = read_model(_Estimates, path, "is not a fit file").parameters
     except ValueError as error:
         raise ValueError(f"ensemble.standard_errors: {error}") from None
     errors = {
         f"plant.{name}": estimate.standard_error
-        for name, estimate in estimates.parameters.items()
+        for name, estimate in estimates.items()
         if estimate.standard_error is not None and np.isfinite(estimate.standard_error)
     }
     if not errors:
         raise ValueError(f"ensemble.standard_errors: {path} holds no standard error")
-    for name in errors:
+    for name, error in errors.items():
         _check_path(nominal, name, "ensemble.standard_errors")
-    return errors
+        _check_inside(nominal, name, error)
+    held = [f"plant.{name}" for name in estimates]
+    return errors, [name for name in held if name not in errors]
+
+
+def _check_inside(stage: Stage, path: str, error: float) -> None:
+    """Raise ValueError if few normal draws are within the limits of ``path``."""
+    limits, value = declared(stage, path), float(get(stage, path))
+    if limits is None or error == 0.0:
+        return
+    low, high = max(limits.above, limits.least), min(limits.below, limits.most)
+    inside = ndtr((high - value) / error) - ndtr((low - value) / error)
+    if not inside >= LEAST_INSIDE:
+        raise ValueError(
+            f"ensemble.standard_errors: {path} is {value:g} with a standard error of "
+            f"{error:g}, but its limits are {low:g} and {high:g}: the record does not "
+            "determine it; give its ensemble.range instead"
+        )

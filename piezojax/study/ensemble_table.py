@@ -33,7 +33,8 @@ class EnsembleTable(Table):
     uniformly."""
     standard_errors: Path | None = None
     """A ``fit.json`` of identify, whose parameters are drawn from normal distributions
-    around their values."""
+    around their values, within their limits. Parameters without a standard error keep
+    their values, and a note names them."""
     tune: Annotated[int, Field(strict=True, ge=0, le=64)] = 0
     """Number of drawn stages in the objective, in addition to the nominal one."""
     margins: Annotated[int, Field(strict=True, ge=0, le=1024)] = 64

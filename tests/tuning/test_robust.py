@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy
 import tomli_w
 
 import piezojax as pj
@@ -407,6 +408,54 @@ def test_draws_follow_the_standard_errors_of_a_fit(tmp_path):
     assert np.mean(first) == pytest.approx(own, abs=2e-4)
     assert np.std(first) == pytest.approx(1e-3, rel=0.1)
     assert np.ptp(np.asarray(drawn[0].a)) == 0.0
+    (note,) = [note for note in case.notes if "standard error" in note]
+    assert "fit.json has no standard error of plant.hysteresis.a, which the" in note
+    varied = tables | {"spread": {"plant.hysteresis.a": 0.1}}
+    assert read(written(tmp_path, changed(ensemble=varied))).ensemble.notes == ()
+
+
+def vague(folder, **errors):
+    """Return the ensemble of a resonance (Hz, ratio) with these standard errors."""
+    values = {"frequency": 400.0, "damping": 0.02}
+    fit = {name: {"value": values[name], "standard_error": errors[name]}
+           for name in errors}  # fmt: skip
+    (folder / "fit.json").write_text(json.dumps({"parameters": fit}))
+    study = changed(
+        plant={"type": "Mode", "dt": 5e-5, **values},
+        ensemble={"standard_errors": "fit.json", "holdout": 1000},
+    )
+    return read(written(folder, study)).ensemble
+
+
+def test_draws_stay_within_the_limits_of_a_parameter(tmp_path):
+    """A normal distribution that is cut off at 0, like that of SciPy."""
+    error = 0.03
+    damping = np.asarray(vague(tmp_path, damping=error).stages("holdout").plant.damping)
+    assert damping.min() > 0.0
+    law = scipy.stats.truncnorm(-0.02 / error, np.inf, loc=0.02, scale=error)
+    assert scipy.stats.kstest(damping, law.cdf).pvalue > 0.01
+    # Draws within the limits are those of the same seed without limits.
+    close = np.asarray(vague(tmp_path, damping=1e-4).stages("holdout").plant.damping)
+    plain = 0.02 + error * (close - 0.02) / 1e-4
+    assert 0.2 < np.mean(plain <= 0.0) < 0.3
+    np.testing.assert_allclose(damping[plain > 0.0], plain[plain > 0.0], rtol=1e-6)
+
+
+def test_a_standard_error_far_beyond_the_limits_is_refused(tmp_path):
+    """A normal distribution has 2/3 of the first, 0.004 of the second below Nyquist."""
+    plant = {"type": "LowPass", "frequency": 4000.0, "dt": 5e-5}
+    table = {"standard_errors": "fit.json", "holdout": 200}
+    study = written(tmp_path, changed(plant=plant, ensemble=table))
+    for error in (5e3, 1e6):
+        fit = {"frequency": {"value": 4000.0, "standard_error": error}}
+        (tmp_path / "fit.json").write_text(json.dumps({"parameters": fit}))
+        if error < 1e6:
+            drawn = read(study).ensemble.stages("holdout").plant.frequency
+            assert 0.0 < drawn.min() < drawn.max() < 1e4
+            continue
+        with pytest.raises(ValueError, match="but its limits are 0 and 10000: the"):
+            read(study)
+
 
 
 @pytest.mark.parametrize(
