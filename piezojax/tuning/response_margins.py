@@ -13,6 +13,7 @@ FIGURES = {
     "gain_margin": ("gain_margin_dB", "the gain margin", " dB", -1.0),
     "phase_margin": ("phase_margin_deg", "the phase margin", " degrees", -1.0),
     "delay_margin": ("delay_margin_samples", "the delay margin", " samples", -1.0),
+    "disk_margin": ("disk_margin", "the disk margin", "", -1.0),
 }
 """Limits by name: field of MeasuredMargins, words, unit; 1 for at most, -1 for at
 least."""

@@ -2,6 +2,7 @@
 
 import re
 
+import control
 import numpy as np
 import pytest
 
@@ -35,7 +36,10 @@ def test_without_an_error_of_the_model_the_margins_are_those_of_the_loop():
     assert exact.stable
     assert found.sensitivity_peak == pytest.approx(exact.sensitivity_peak, rel=1e-4)
     assert found.sensitivity_peak_Hz == pytest.approx(exact.sensitivity_peak_Hz, 5e-3)
-    for name in ("gain_margin_dB", "phase_margin_deg", "delay_margin_samples"):
+    for name in (
+        *("gain_margin_dB", "phase_margin_deg", "delay_margin_samples"),
+        "disk_margin",
+    ):
         assert getattr(found, name) == pytest.approx(getattr(exact, name), rel=1e-3)
 
 
@@ -53,6 +57,14 @@ def test_the_margins_are_those_of_the_measured_plant():
     # The phase is -180 degrees at 3 w = pi / 2.
     gain = 2.0 * np.sin(np.pi / 12.0) / 0.26
     assert found.gain_margin_dB == pytest.approx(20.0 * np.log10(gain), rel=1e-3)
+
+
+@pytest.mark.parametrize("gain", [0.5, 1.3, 2.0])
+def test_the_disk_margin_is_that_of_python_control(gain):
+    stage = control.tf(0.2 * gain, [1.0, -1.0, 0.0, 0.0], DT)
+    expected, *_ = control.disk_margins(stage, 2.0 * np.pi * LINES)
+    found = measured_margins(LOOP, LINES, np.full(LINES.size, gain, complex))
+    assert found.disk_margin == pytest.approx(expected, rel=1e-6)
 
 
 @pytest.mark.parametrize(("gain", "stable"), [(2.8, True), (3.4, False)])
@@ -88,11 +100,17 @@ def measured(**changed):
         "gain_margin_dB": 9.0,
         "phase_margin_deg": 60.0,
         "delay_margin_samples": 2.0,
+        "disk_margin": 0.9,
     }
     return {"after": MeasuredMargins(**figures | changed)}
 
 
-LIMITS = {"sensitivity_peak": 2.0, "delay_margin": 1.0, "gain_margin": 6.0}
+LIMITS = {
+    "sensitivity_peak": 2.0,
+    "delay_margin": 1.0,
+    "gain_margin": 6.0,
+    "disk_margin": 0.7,
+}
 
 
 @pytest.mark.parametrize(
@@ -108,6 +126,9 @@ LIMITS = {"sensitivity_peak": 2.0, "delay_margin": 1.0, "gain_margin": 6.0}
             r"Ms is 2.2 at 40 Hz \(limit 2; 1.\d+ on the model\): tighten const",
         ),
         ({"delay_margin_samples": 0.9}, "the delay margin is 0.9 samples"),
+        ({"disk_margin": 0.68}, None),
+        ({"disk_margin": None}, None),
+        ({"disk_margin": 0.5}, r"the disk margin is 0.5 \(limit 0.7; 0.\d+ on the"),
         ({"gain_margin_dB": 5.0}, r"the gain margin is 5 dB \(limit 6; \d"),
     ],
 )

@@ -18,7 +18,8 @@ class MeasuredMargins(BaseModel):
 
     ``stable`` is True if 1 + L encircles 0 as often as with the model, with which the
     loop is stable. ``sensitivity_peak`` is the largest |S| at a line, at
-    ``sensitivity_peak_Hz``. ``gain_margin_dB`` is the smallest gain above 1 that makes
+    ``sensitivity_peak_Hz``, and ``disk_margin`` is 1 / max |(S - T)/2| over the lines,
+    None in a result of an older version. ``gain_margin_dB`` is the smallest gain above 1 that makes
     the loop unstable, ``phase_margin_deg`` the smallest such phase, lag or lead, and
     ``delay_margin_samples`` the smallest such delay. Each is interpolated between two
     lines, and None if no such change moves L to -1 within the lines. They extend from
@@ -34,6 +35,7 @@ class MeasuredMargins(BaseModel):
     gain_margin_dB: float | None  # noqa: N815
     phase_margin_deg: float | None
     delay_margin_samples: float | None
+    disk_margin: float | None = None
 
 
 def measured_margins(
@@ -70,6 +72,7 @@ def measured_margins(
         gain_margin_dB=20.0 * float(np.log10(gains.min())) if gains.size else None,
         phase_margin_deg=float(np.degrees(phases.min())) if phases.size else None,
         delay_margin_samples=float(delays.min()) if delays.size else None,
+        disk_margin=2.0 / float(np.max(np.abs(1.0 - L) * size)),
     )
 
 
