@@ -15,6 +15,8 @@ from .stability.model_error import worst_delay_margin, worst_sensitivity
 from .stability.operating_point import BRANCHES, OperatingPoint
 from .stability.sampled_margins import (
     BANDS,
+    UNLIMITED_DELAY,
+    UNLIMITED_GAIN,
     bandwidth_of,
     closed_loop_peak_of,
     delay_margin_of,
@@ -72,6 +74,8 @@ class Constraint(NamedTuple):
     none. ``one_axis`` is True if the figure is defined for one axis only. ``bands`` is
     the number of values for each plant and branch. ``meaning`` describes the figure,
     ``remedy`` is the advice if it violates its limit, in place of that to search again.
+    ``unlimited`` is the value of a margin if no change of its kind makes the loop
+    unstable.
     """
 
     unit: str
@@ -85,6 +89,16 @@ class Constraint(NamedTuple):
     bands: int = 1
     meaning: str = "Figure of another package"
     remedy: str = ""
+    unlimited: float = math.inf
+
+    def number(self, value: float) -> str:
+        """Return ``value`` in four digits, or "unlimited" if nothing limits it."""
+        return "unlimited" if value >= self.unlimited else f"{value:.4g}"
+
+    def quantity(self, value: float) -> str:
+        """Return the ``number`` of ``value`` with its unit, if it has one."""
+        plain = self.unit == "1" or value >= self.unlimited
+        return self.number(value) + ("" if plain else f" {self.unit}")
 
     def check(self, name: str, limit: Any) -> None:
         """Raise ValueError unless ``limit`` is a number in its bounds, or ``OFF``."""
@@ -240,6 +254,7 @@ CONSTRAINTS: dict[str, Constraint] = {
         _margin("delay_margin"),
         default=1.0,
         meaning="Smallest delay that makes the loop unstable",
+        unlimited=UNLIMITED_DELAY,
     ),
     "peak_voltage": Constraint(
         "V",
@@ -278,6 +293,7 @@ CONSTRAINTS: dict[str, Constraint] = {
         "margins",
         _margin("gain_margin"),
         meaning="Smallest gain factor above 1 that makes the loop unstable",
+        unlimited=UNLIMITED_GAIN,
     ),
     "phase_margin": Constraint(
         "deg",
@@ -286,6 +302,7 @@ CONSTRAINTS: dict[str, Constraint] = {
         _margin("phase_margin"),
         below=180.0,
         meaning="Smallest phase lag or lead that makes the loop unstable",
+        unlimited=180.0,
     ),
     "bandwidth": Constraint(
         "Hz",

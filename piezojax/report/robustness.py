@@ -23,15 +23,14 @@ def constraints_table(result: Result) -> Table:
         table.add_column(name, justify="right", no_wrap=True)
     unseen = result.perturbed.constraints if result.perturbed else {}
     for name, kept in result.constraints.items():
-        unit = "" if kept.unit == "1" else f" {kept.unit}"
         state = "missed" if not kept.kept else "active" if kept.active else "kept"
         held_out = unseen.get(name)
         table.add_row(
             f"{name}, {kept.sense}",
-            f"{kept.limit:.4g}{unit}",
-            _number(kept.value),
+            CONSTRAINTS[name].quantity(kept.limit),
+            _number(name, kept.value),
             state,
-            f"{_number(held_out.value)}, kept on {held_out.on} of {held_out.of}"
+            f"{_number(name, held_out.value)}, kept on {held_out.on} of {held_out.of}"
             if held_out
             else "-",
         )
@@ -47,7 +46,7 @@ def front_table(front: Sequence[FrontPoint], constraint: str) -> Table:
         error, failed = point.geomean_rms_um, point.loss >= FAILED_LOSS
         table.add_row(
             f"{point.limit:.4g}",
-            _number(point.value) + ("" if point.kept else ", missed"),
+            _number(constraint, point.value) + ("" if point.kept else ", missed"),
             "diverges" if error is None else f"{1e3 * error:.2f}",
             "failed" if failed else f"{point.loss:.3f}",
         )
@@ -76,9 +75,11 @@ def perturbed_figure(perturbed: Perturbed | None, title: str) -> Figure | None:
     panel.set_ylabel(f"share of {perturbed.plants} held-out plants, %")
     panel.legend()
     for panel, name in zip(panels[1:], limited, strict=True):
-        values = [value for value in perturbed.values[name] if value is not None]
-        kept = perturbed.constraints[name]
-        _distribution(panel, values, perturbed.plants, color=AFTER, label="tuned")
+        known = [value for value in perturbed.values[name] if value is not None]
+        values = [value for value in known if value < CONSTRAINTS[name].unlimited]
+        kept, lost = perturbed.constraints[name], len(known) - len(values)
+        label = f"tuned, unlimited on {lost}" if lost else "tuned"
+        _distribution(panel, values, perturbed.plants, color=AFTER, label=label)
         panel.axvline(kept.limit, color="0.3", ls="--", label=f"limit, {kept.sense}")
         panel.set_xlabel(_constraint_label(name))
         panel.legend()
@@ -125,5 +126,5 @@ def _constraint_label(constraint: str) -> str:
     return name if unit == "1" else f"{name}, {unit}"
 
 
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4g}"
+def _number(constraint: str, value: float | None) -> str:
+    return "-" if value is None else CONSTRAINTS[constraint].number(value)

@@ -274,9 +274,12 @@ def _margins(reports: Sequence[StabilityReport]) -> tuple[str, ...]:
     worst = worst_margins(reports)
     if worst is None:
         return _UNSTABLE
+    figures = (
+        (worst.gain_margin_dB, "{:.1f} dB"),
+        (worst.phase_margin_deg, "{:.1f}°"),
+        (worst.delay_margin_samples, "{:.2f} samples"),
+    )
     return (
         f"{worst.sensitivity_peak:.2f}",
-        f"{worst.gain_margin_dB:.1f} dB",
-        f"{worst.phase_margin_deg:.1f}°",
-        f"{worst.delay_margin_samples:.2f} samples",
+        *(text.format(x) if math.isfinite(x) else "unlimited" for x, text in figures),
     )

@@ -12,7 +12,6 @@ import scipy.stats.qmc
 
 from ..analysis.constraints import CONSTRAINTS, margin_figures
 from ..analysis.stability.operating_point import OperatingPoint
-from ..analysis.stability.sampled_margins import UNLIMITED_DELAY, UNLIMITED_GAIN
 from ..analysis.step_response import NAMES, step_ends
 from ..core.arrays import as_array
 from ..core.rollout import in_blocks
@@ -43,10 +42,14 @@ STEP = NAMES[0]
 
 
 class Margin(NamedTuple):
-    """A margin of ``CONSTRAINTS``, and its value if nothing limits it."""
+    """A margin of ``CONSTRAINTS``."""
 
     constraint: str
-    unlimited: float
+
+    @property
+    def unlimited(self) -> float:
+        """Value of the margin if nothing limits it."""
+        return CONSTRAINTS[self.constraint].unlimited
 
     @property
     def unit(self) -> str:
@@ -60,10 +63,10 @@ class Margin(NamedTuple):
 
 
 MARGINS = {
-    "sensitivity peak": Margin("sensitivity_peak", math.inf),
-    "gain margin": Margin("gain_margin", UNLIMITED_GAIN),
-    "phase margin": Margin("phase_margin", 180.0),
-    "delay margin": Margin("delay_margin", UNLIMITED_DELAY),
+    "sensitivity peak": Margin("sensitivity_peak"),
+    "gain margin": Margin("gain_margin"),
+    "phase margin": Margin("phase_margin"),
+    "delay margin": Margin("delay_margin"),
 }
 """Margins of a gain set by name."""
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..analysis.constraints import CONSTRAINTS
 from ..analysis.limit import LimitReport, performance_limit
 from ..analysis.stability import StabilityReports
 from ..analysis.step_response import NAMES as STEPS
@@ -105,8 +106,8 @@ class Outcome:
             ),
         ]
         return found + [
-            f"{name} {outcome.value:.4g} {outcome.unit} on the worst of {outcome.of} "
-            f"{kind} plants"
+            f"{name} {CONSTRAINTS[name].quantity(outcome.value)} on the worst of "
+            f"{outcome.of} {kind} plants"
             for kind, (name, outcome) in outcomes
             if outcome.of > 1 and outcome.value is not None
         ]

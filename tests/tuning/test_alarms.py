@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,10 +15,17 @@ from piezojax.analysis.stability import StabilityReports, axes_report_of, report
 from piezojax.analysis.stability.assess import AxesStability
 from piezojax.analysis.stability.conserved import LinearAxes, LinearLoop
 from piezojax.analysis.stability.following import Following
+from piezojax.analysis.stability.sampled_margins import (
+    delay_margin_of,
+    gain_margin_of,
+    phase_margin_of,
+)
 from piezojax.cli.tune import main
 from piezojax.core.files import write_json
+from piezojax.report.robustness import constraints_table, perturbed_figure
 from piezojax.report.tuning_tables import following_table, stability_table
 from piezojax.tuning.alarms import DISAGREE, alarms_of, exact_peak
+from piezojax.tuning.outcome import Outcome
 from piezojax.tuning.result import ConstraintOutcome, Perturbed, Result, Scores
 from piezojax.tuning.step_tests import StepResult
 
@@ -387,6 +395,65 @@ def test_a_margin_of_nan_is_an_alarm():
 def test_alarms_of_a_fit_are_alarms_of_the_gains():
     missed = ["the model misses a mode at 780 Hz: add it"]
     assert alarms(model=missed) == missed
+
+
+def test_margins_that_nothing_limits_are_unlimited_in_every_text():
+    """S of a loop that hardly acts: |L| stays below 1, and L off the negative axis."""
+    angle = np.linspace(0.0, np.pi, 500)
+    loop = 0.01 * (1.0 - 0.5 * np.exp(-1j * angle)) ** -1
+    S = (1.0 / (1.0 + loop))[:, None, None]
+    found = {
+        "delay_margin": delay_margin_of(S),
+        "gain_margin": gain_margin_of(S),
+        "phase_margin": phase_margin_of(S),
+        "sensitivity_peak": 1.25,
+    }
+    limits = {name: 1.0 if "peak" not in name else 2.0 for name in found}
+    kept = {
+        name: outcome(name, [float(value)] * 3, limits[name])
+        for name, value in found.items()
+    }
+    values = {name: [float(value)] * 3 for name, value in found.items()}
+    values["delay_margin"][0] = 3.5
+    drawn = perturbed(**kept).model_copy(
+        update={
+            "plants": 3,
+            "values": values,
+            "geomeans_um": [1.0] * 3,
+            "geomeans_before_um": [2.0] * 3,
+        }
+    )
+    found = changed(constraints=kept, perturbed=drawn)
+    table = constraints_table(found)
+    assert [*table.columns[1].cells] == ["1 samples", "1 dB", "1 deg", "2"]
+    assert [*table.columns[2].cells] == [*["unlimited"] * 3, "1.25"]
+    assert [*table.columns[4].cells] == [
+        *["unlimited, kept on 3 of 3"] * 3,
+        "1.25, kept on 3 of 3",
+    ]
+    judged = Outcome.judged.fget(
+        SimpleNamespace(stability=reports(0.1), result=found)
+    )
+    assert judged[1:] == [
+        *(f"{name} unlimited on the worst of 3 tuning plants" for name in [*kept][:3]),
+        "sensitivity_peak 1.25 on the worst of 3 tuning plants",
+        *(
+            f"{name} unlimited on the worst of 3 held-out plants"
+            for name in [*kept][:3]
+        ),
+        "sensitivity_peak 1.25 on the worst of 3 held-out plants",
+    ]
+    _, *panels = perturbed_figure(drawn, "").axes
+    for panel, lost in zip(panels, (2, 3, 3, 0), strict=True):
+        curve = panel.lines[0]
+        assert len(curve.get_xdata()) == 3 - lost
+        shown = f"tuned, unlimited on {lost}" if lost else "tuned"
+        assert curve.get_label() == shown
+    # The exact margins of the nominal plant are infinite.
+    still = LinearLoop(np.array([[0.5]]), np.ones(1), np.array([-0.01]), 1e-4)
+    stability = StabilityReports(reports={"after": {"ascending": report_of(still)}})
+    assert [*stability_table(stability).columns[3].cells] == ["unlimited"]
+    assert [*stability_table(stability).columns[4].cells] == ["unlimited"]
 
 
 def test_json_contains_null_for_nan(tmp_path):
