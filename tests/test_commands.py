@@ -812,6 +812,28 @@ def test_model_help_lists_the_models(record):
     assert all(name in result.stdout.split() for name in parts())
 
 
+@pytest.mark.parametrize(
+    "model", [("lag",), ("all", "--among", "coleman_hodgdon", "--steps", "1")]
+)
+def test_identify_with_an_alarm_ends_with_status_3(record, tmp_path, model):
+    """From the middle of the record on, the stage moves twice as far."""
+    header, *rows = record.read_text(encoding="utf-8").splitlines()
+    for i, row in enumerate(rows):
+        time, drive, sensor = row.split(",")
+        moved = (2.0 if i >= 150 else 1.0) * (float(sensor) - 4.0)
+        rows[i] = f"{time},{drive},{moved:.6f}"
+    record.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
+    out = tmp_path / "out"
+    command = ("identify", record, *COLUMNS, "--model", *model, "--out", out)
+    result = call(*command, "--quiet")
+    assert result.exit_code == 3
+    assert result.stdout == ""
+    assert "ALARM: the model explains little: its validation" in result.stderr
+    assert {"model.json", "report.html"} <= {*names(out)}
+    with pytest.raises(ValueError, match="the model explains little"):
+        pj.load(out / "model.json")
+
+
 def test_identify_bad_input(record, tmp_path):
     out = ("--out", tmp_path / "out")
     failed(call("identify", tmp_path / "no.csv", *out), "no.csv: No such file or dir")

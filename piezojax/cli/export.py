@@ -79,7 +79,9 @@ def main(
     one of them. For C, `make test` in the new folder compiles the source and replays a
     simulation. A controller in C is also compiled here and judged in the simulated loop
     of its study; report.json has its errors in double and float, and the time of a
-    step. If this loop diverges, the files begin with an alarm, and the exit status is 3.
+    step.
+
+    Exit status 3 means that this loop diverges; the files then begin with the alarm.
     """
 
     def body(console):
@@ -119,9 +121,9 @@ def export_file(
     """Export the System in the file or folder ``source`` and print the result.
 
     Return the alarms of the exported controller in the simulated loop; those of its
-    file are refused, or accepted by ``accept_unsafe``. ``runs`` are the runs of the study, which judge a controller in C; by default they
-    are computed from the file of the study. The other arguments are the options of the
-    command.
+    file are refused, or accepted by ``accept_unsafe``. ``runs`` are the runs of the
+    study, which judge a controller in C; by default they are computed from the file of
+    the study. The other arguments are the options of the command.
     """
     from ..core.files import read_model
     from ..core.serial import load, read_about

@@ -7,6 +7,7 @@ import click
 from .command import (
     Command,
     common,
+    exit_unsafe,
     given,
     print_loading,
     print_results,
@@ -200,6 +201,9 @@ def main(
 
     A RECORD is a text file (.csv, .txt, .dat) or a .npz, .mat or .h5 file; with
     piezojax[lab] also a .tdms, .lvm or .xlsx file.
+
+    Exit status 3 means that the model has an alarm. The alarms are printed first, and
+    model.json loads only with accept_unsafe.
     """
     del seed  # the random starts of a fit have fixed seeds
     numbers = given("order", "window", "oversample", "steps")
@@ -276,6 +280,7 @@ def main(
             page = fit_page(fit)
             write_page(page, folder, pictures)
         print_results(page, folder, console)
+        exit_unsafe(page.alarms)
 
     def check_used(where, used):
         idle = [f"--{name}" for name in numbers if name not in used]
@@ -349,5 +354,6 @@ def main(
                 soft_wrap=True,
             )
             exit_interrupted()
+        exit_unsafe(page.alarms)
 
     run(quiet, body)

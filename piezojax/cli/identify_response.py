@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 from rich.console import Console
 
-from .command import print_results, results_folder
+from .command import exit_unsafe, print_results, results_folder
 from .records import print_columns
 from .terminal import Bar
 
@@ -69,7 +69,10 @@ def fit_responses(
     options: ResponseOptions,
     out: Path | None,
 ) -> None:
-    """Read or measure the responses, fit their modes, write and print the results."""
+    """Read or measure the responses, fit their modes, write and print the results.
+
+    End the command if the model has alarms.
+    """
     from ..identification.response_levels import compare_levels
     from ..identification.response_model import identify_response
     from ..report.page import write_page
@@ -111,6 +114,7 @@ def fit_responses(
         )
         write_page(page, folder, pictures)
     print_results(page, folder, console)
+    exit_unsafe(page.alarms)
 
 
 Found = list[tuple["FrequencyResponse", "Measurement | None"]]

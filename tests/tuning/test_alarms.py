@@ -271,7 +271,8 @@ def test_a_response_that_is_not_known_leaves_the_outcome_of_the_search():
         report_of(integrator(0.1)), following=Following(400.0, 200.0, 1.2, 350.0)
     )
     unknown = report_of(integrator(0.1))
-    assert unknown.stable and unknown.following is None
+    assert unknown.stable
+    assert unknown.following is None
     limits = {"bandwidth": 300.0, "closed_loop_peak": 1.5}
     missed = {
         "bandwidth": outcome("bandwidth", [250.0], 300.0),
@@ -431,9 +432,7 @@ def test_margins_that_nothing_limits_are_unlimited_in_every_text():
         *["unlimited, kept on 3 of 3"] * 3,
         "1.25, kept on 3 of 3",
     ]
-    judged = Outcome.judged.fget(
-        SimpleNamespace(stability=reports(0.1), result=found)
-    )
+    judged = Outcome.judged.fget(SimpleNamespace(stability=reports(0.1), result=found))
     assert judged[1:] == [
         *(f"{name} unlimited on the worst of 3 tuning plants" for name in [*kept][:3]),
         "sensitivity_peak 1.25 on the worst of 3 tuning plants",

@@ -457,7 +457,6 @@ def test_a_standard_error_far_beyond_the_limits_is_refused(tmp_path):
             read(study)
 
 
-
 @pytest.mark.parametrize(
     ("over", "tail"), [("mean", 1.0), ("worst", 1.0), ("cvar", 0.4)]
 )

@@ -19,11 +19,11 @@ class MeasuredMargins(BaseModel):
     ``stable`` is True if 1 + L encircles 0 as often as with the model, with which the
     loop is stable. ``sensitivity_peak`` is the largest |S| at a line, at
     ``sensitivity_peak_Hz``, and ``disk_margin`` is 1 / max |(S - T)/2| over the lines,
-    None in a result of an older version. ``gain_margin_dB`` is the smallest gain above 1 that makes
-    the loop unstable, ``phase_margin_deg`` the smallest such phase, lag or lead, and
-    ``delay_margin_samples`` the smallest such delay. Each is interpolated between two
-    lines, and None if no such change moves L to -1 within the lines. They extend from
-    ``lowest_Hz`` to ``highest_Hz``; nothing is known outside this band.
+    None in a result of an older version. ``gain_margin_dB`` is the smallest gain above
+    1 that makes the loop unstable, ``phase_margin_deg`` the smallest such phase, lag or
+    lead, and ``delay_margin_samples`` the smallest such delay. Each is interpolated
+    between two lines, and None if no such change moves L to -1 within the lines. They
+    extend from ``lowest_Hz`` to ``highest_Hz``; nothing is known outside this band.
     """
 
     lines: int
