@@ -26,7 +26,12 @@ from .known_plant import KnownPlant
 from .methods import INPUT_BEFORE, ZERO, method_for
 from .plausibility import assumed_units, early_warnings, plausibility_warnings
 from .records.checks import record_warnings
-from .records.parts import check_compatible, check_train, train_and_validation
+from .records.parts import (
+    check_compatible,
+    check_train,
+    longest_first,
+    train_and_validation,
+)
 from .records.record import Record
 from .residuals.report import ResidualReport, residual_report
 
@@ -249,7 +254,7 @@ def identify(
     began, options = time.perf_counter(), options or Options()
     records = (records,) if isinstance(records, Record) else tuple(records)
     check_compatible(records)
-    records = tuple(sorted(records, key=lambda record: -record.samples))
+    records = longest_first(records)
     train, validate = train_and_validation(records[0].samples, train, validate)
     check_train(records, train)
     check_approach(records, options)

@@ -17,6 +17,7 @@ from ..core.serial import load, save, to_data
 from .estimators.estimate import Options
 from .fit import Fit, FitReport
 from .ranking import file_name
+from .records.parts import longest_first
 from .records.record import Record
 
 FOLDER = "search"
@@ -95,7 +96,7 @@ class Unfinished:
             fit = Fit(
                 load(self._folder / f"{stem}.json", accept_unsafe=True),
                 read_model(FitReport, self._folder / f"{stem}.fit.json", "is damaged"),
-                tuple(records),
+                longest_first(records),  # as in the fit
                 _several(arrays, "run"),
                 train,
                 validate,

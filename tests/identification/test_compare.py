@@ -26,6 +26,7 @@ from piezojax.identification.candidates import parts_at
 from piezojax.identification.estimators.estimate import Options
 from piezojax.identification.fit import Fit, FitError, FitReport
 from piezojax.identification.ranking import RankingReport
+from piezojax.identification.records.parts import longest_first
 from piezojax.report.model_ranking import (
     ranking_notes,
     ranking_table,
@@ -37,6 +38,7 @@ HYSTERESIS = parts_at("hysteresis")
 TIME = np.arange(2000) * 1e-3
 TONES = sum(np.sin(2 * np.pi * f * TIME + f) for f in (2.0, 9.0, 31.0, 77.0))
 RICH = Record(TONES, 0.1 * TONES + 1.0, 1e-3, source="made up")
+SHORT = RICH.until(1700)
 
 
 def test_an_unknown_hysteresis_is_refused():
@@ -55,6 +57,7 @@ def made_up(records, model, *, train, validate, progress, method, options):
     """Return a fit whose errors are the noise plus a part of the model."""
     progress.stage("fitting", 1)
     head = model.split("+")[0]
+    records = longest_first(records)
     own = BIAS.get(head, 0.5) * np.sin(np.arange(2000))[:, None]
     off = 0.01 * (NOISE + own)
     runs = tuple(record.outputs + off[: record.samples] for record in records)
@@ -62,7 +65,7 @@ def made_up(records, model, *, train, validate, progress, method, options):
     report = FitReport(
         model=model, parameters={}, train=blank, validation=blank, warnings=[], wall_s=0
     )
-    fit = Fit(Affine(2.0), report, tuple(records), runs, train, validate, None, 5)
+    fit = Fit(Affine(2.0), report, records, runs, train, validate, None, 5)
     fit.report.train = fit.error_over(train)
     fit.report.validation = fit.error_over(validate)
     return fit
@@ -202,7 +205,7 @@ def counted(monkeypatch, stop=None):
 
 
 @pytest.mark.usefixtures("optimised")
-@pytest.mark.parametrize("records", [[RICH], [RICH, RICH]])
+@pytest.mark.parametrize("records", [[RICH], [RICH, RICH], [SHORT, RICH]])
 def test_an_interrupted_search_goes_on(records, made, monkeypatch, tmp_path):
     made({"bouc_wen": ValueError("fails")})
     whole = identify_all(records)

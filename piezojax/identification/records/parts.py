@@ -1,8 +1,15 @@
 """Records that are fitted together, and their parts to fit and to validate on."""
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from .record import Record
+
+
+def longest_first(records: Iterable[Record]) -> tuple[Record, ...]:
+    """Return ``records`` sorted by length; those of equal length keep their order."""
+    return tuple(sorted(records, key=lambda record: -record.samples))
 
 
 def check_compatible(records: tuple[Record, ...]) -> None:
