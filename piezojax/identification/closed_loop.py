@@ -168,7 +168,8 @@ def _joint(
     options: Options,
     progress: Progress,
 ) -> LoopFit:
-    clean = [without_noise(record.until(train.stop)) for record in records]
+    parts = [record.until(train.stop) for record in records]
+    clean = [without_noise(part) for part in parts]
     shape = _structure(model, training_record(clean, train))
     if hystereses(shape.system):
         raise ValueError(
@@ -179,8 +180,8 @@ def _joint(
         shape, clean, train, steps=options.steps, progress=progress, noise_model=True
     )
     share = [
-        float(np.var(own.input - whole.input[: own.samples]) / np.var(whole.input))
-        for own, whole in zip(clean, records, strict=True)
+        float(np.var(own.input - whole.input) / np.var(whole.input))
+        for own, whole in zip(clean, parts, strict=True)
     ]
     excited = 100.0 * (1.0 - max(share))
     warnings = []

@@ -382,21 +382,45 @@ def test_indirect_simulates_the_loop_under_its_controller(monkeypatch):
     assert "the controller does not explain the recorded voltage" in warning
 
 
-@pytest.mark.parametrize(("reference", "noisy"), [(0.05, True), (3.0, False)])
-def test_joint_warns_where_noise_drives_the_input(monkeypatch, reference, noisy):
-    record, _ = loop("slow PI", 1500, 4, reference=reference)
+@pytest.fixture
+def unfitted(monkeypatch):
+    """Replace a fit by its starts."""
 
-    def unfitted(structure, records, train, **_):
+    def starts(structure, records, train, **_):
         problem = problem_of(structure, records, train)
         return Optimum(problem, structure.starts, np.zeros(1), True)
 
-    monkeypatch.setattr(closed_loop, "output_error", unfitted)
+    monkeypatch.setattr(closed_loop, "output_error", starts)
+
+
+@pytest.mark.usefixtures("unfitted")
+@pytest.mark.parametrize(("reference", "noisy"), [(0.05, True), (3.0, False)])
+def test_joint_warns_where_noise_drives_the_input(reference, noisy):
+    record, _ = loop("slow PI", 1500, 4, reference=reference)
     every = slice(0, record.samples)
     options = Options(closed_loop="joint")
     found = closed_loop.loop_fit("mode", [record], every, options, Silent())
     assert not found.scatter_known
-    texts = [text for text in found.warnings if "keeps a share of the noise" in text]
-    assert len(texts) == noisy
+    assert share_warnings(found) == noisy
+
+
+def share_warnings(found):
+    """Return how many warnings of a fit name the share of the noise."""
+    return sum("keeps a share of the noise" in text for text in found.warnings)
+
+
+@pytest.mark.usefixtures("unfitted")
+def test_samples_after_the_training_part_do_not_hide_the_noise():
+    quiet, _ = loop("slow PI", 1500, 4, reference=0.05)
+    later, _ = loop("slow PI", 1500, 5, reference=3.0)
+    signals = ("inputs", "outputs", "reference", "dither")
+    both = [np.concatenate([getattr(r, s) for r in (quiet, later)]) for s in signals]
+    columns = dict(zip(signals, both, strict=True))
+    record = replace(quiet, **columns)
+    options = Options(closed_loop="joint")
+    train = slice(0, quiet.samples)
+    found = closed_loop.loop_fit("mode", [record], train, options, Silent())
+    assert share_warnings(found) == 1
 
 
 def test_the_command_fits_a_loop(tmp_path, monkeypatch):
