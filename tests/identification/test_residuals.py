@@ -7,7 +7,7 @@ import pytest
 import scipy.signal
 
 from piezojax import Record, identify, save
-from piezojax.core.error_bound import UNSEEN
+from piezojax.core.error_bound import UNSEEN, ErrorBound
 from piezojax.core.serial import read_about
 from piezojax.identification import FitReport
 from piezojax.identification.plausibility import plausibility_warnings
@@ -16,6 +16,7 @@ from piezojax.identification.residuals.bound import (
     ABSORBED,
     RelativeError,
     error_bound,
+    joined,
     relative_error,
 )
 from piezojax.identification.residuals.correlation import (
@@ -335,6 +336,22 @@ def test_of_several_records_the_larger_error_counts():
     np.testing.assert_array_equal(both.at(low), alone[1].at(low))
     np.testing.assert_array_equal(both.at(high), alone[0].at(high))
     assert np.all(both.excited_at(high))
+
+
+def test_no_peak_is_lost_between_the_lines_of_another_record():
+    wide, narrow = (
+        ErrorBound(
+            frequency=tuple(lines),
+            relative=tuple(np.where(lines == 810.0, 5.0, 0.1)),
+            excited=(True,) * lines.size,
+        )
+        for lines in (np.geomspace(10.0, 5000.0, 60), np.arange(760.0, 901.0, 10.0))
+    )
+    both = joined([wide, narrow])
+    for line, relative in zip(narrow.frequency, narrow.relative, strict=True):
+        assert both.at(line) >= relative
+    assert both.at(700.0) == both.at(950.0) == 0.1
+    assert joined([narrow, wide]) == both
 
 
 # Statistics

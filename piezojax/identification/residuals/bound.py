@@ -191,18 +191,23 @@ def error_bound(
 def joined(bounds: Sequence[ErrorBound]) -> ErrorBound:
     """Return one bound from those of several records.
 
-    The bound at a line is the largest of the records that excite it, or, if none does,
-    the smallest of all.
+    The bound at a line of any of them is the largest of the records that excite it, or,
+    if none does, the smallest of all. A line next to an excited one of a record has at
+    least the bound of that line.
     """
     if len(bounds) == 1:
         return bounds[0]
-    lines = max(bounds, key=lambda bound: len(bound.frequency)).frequency
-    excited = np.array([bound.excited_at(lines) for bound in bounds])
-    relative = np.array([bound.at(lines) for bound in bounds])
-    known = np.where(excited, relative, 0.0).max(axis=0)
-    anywhere = np.asarray(excited.any(axis=0))
-    relative = np.where(anywhere, known, relative.min(axis=0))
-    return _bound(np.asarray(lines), relative, anywhere)
+    lines = np.unique(np.concatenate([bound.frequency for bound in bounds]))
+    anywhere = np.any([bound.excited_at(lines) for bound in bounds], axis=0)
+    known = np.max([_excited_only(bound).at(lines) for bound in bounds], axis=0)
+    least = np.min([bound.at(lines) for bound in bounds], axis=0)
+    return _bound(lines, np.where(anywhere, known, least), np.asarray(anywhere))
+
+
+def _excited_only(bound: ErrorBound) -> ErrorBound:
+    """Return ``bound`` with 0 at the lines that its record does not excite."""
+    relative = np.where(bound.excited, bound.relative, 0.0)
+    return bound.model_copy(update={"relative": tuple(relative.tolist())})
 
 
 def _completed(found: RelativeError, record: Record) -> ErrorBound:
