@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.signal
+import scipy.stats
 
 from piezojax import Record, identify, save
 from piezojax.core.error_bound import UNSEEN, ErrorBound
@@ -15,6 +16,7 @@ from piezojax.identification.records.record import rises_evenly
 from piezojax.identification.residuals.bound import (
     ABSORBED,
     RelativeError,
+    deviations,
     error_bound,
     joined,
     relative_error,
@@ -134,7 +136,8 @@ def between_lines(peak, level=1.0, noise=30.0, seed=0):
     draw = np.random.default_rng(seed).standard_normal((2, frequency.size)) / 2.3
     true = level + peak / np.abs(1.0 - (frequency / 1000.0) ** 2 + 0.02j) / 50.0
     error = np.abs(np.where(excited, true, 0.0) + margin * (draw[0] + 1j * draw[1]))
-    return RelativeError(frequency, error, margin, np.full(frequency.size, 0.01), 5.0)
+    gain = np.full(frequency.size, 0.01)
+    return RelativeError(frequency, error, margin, gain, 5.0, averages=15.0)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -323,6 +326,41 @@ def test_periodic_records_have_their_excited_lines():
     expected = true_error(STAGE, SLOW, found.frequency[seen])
     np.testing.assert_allclose(found.error[seen], expected, rtol=0.2, atol=0.05)
     assert np.mean(found.upper[seen] > expected) > 0.95
+
+
+@pytest.mark.parametrize("periods", [2, 3, 4, 8])
+@pytest.mark.parametrize("gain", [1.0, 1.2])
+def test_the_interval_holds_at_its_level_for_any_number_of_periods(periods, gain):
+    """The variance from few periods is uncertain, and a wider interval allows for it.
+
+    For a right model the error is complex and the level is exact. For a wrong one the
+    interval of the modulus contains it more often.
+    """
+    period, inside, sure, draws = 512, [], 0, 40
+    random = np.random.default_rng([77, periods])
+    for _ in range(draws):
+        phases = np.exp(2j * np.pi * random.uniform(size=period // 2 - 1))
+        input = np.tile(np.fft.irfft(np.r_[0.0, phases, 0.0]), periods)
+        noise = 0.02 * input.std() * random.standard_normal(input.size)
+        record = Record(input, gain * input + noise, DT, period=period)
+        found = relative_error(record, input, slice(0, input.size))
+        inside += [*(np.abs(found.error - (gain - 1.0)) <= found.margin)]
+        sure += bool(np.any(found.sure))
+        assert found.error.size == period // 2 - 1
+    if gain == 1.0:
+        assert np.mean(inside) == pytest.approx(0.99, abs=0.004)
+        assert sure <= 3  # 1 % of the records
+    else:
+        assert np.mean(inside) > 0.99
+
+
+@pytest.mark.parametrize("chance", [0.05, 0.01, 1e-5])
+def test_the_half_width_is_a_quantile_of_the_f_distribution(chance):
+    for averages in (2.0, 2.84, 3.0, 8.0, 15.0, 100.0):
+        quantile = scipy.stats.f.ppf(1.0 - chance, 2, 2.0 * (averages - 1.0))
+        found = deviations(averages, chance)
+        assert found == pytest.approx(np.sqrt(quantile), rel=1e-8)
+    assert np.isfinite(deviations(1.0, chance))
 
 
 def test_of_several_records_the_larger_error_counts():

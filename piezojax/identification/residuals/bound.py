@@ -8,6 +8,7 @@ confidence interval. In a closed loop noise reaches the input too; if the record
 a reference or a dither, the ratio is that of the responses to it.
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -18,9 +19,8 @@ from ..estimators.loop_response import joint_response
 from ..estimators.welch import SHORTEST, SpectralResponse, spectral_response
 from ..records.record import Record
 
-CONFIDENCE = 2.3
-"""Bound of an estimated response's error, in standard deviations of its modulus: 99 %
-for 15 averages (Bendat and Piersol, Random Data, 4th ed., 9.2)."""
+OUTSIDE = 0.01
+"""Probability that the error of a line lies outside its interval."""
 
 
 LEAST = 1e-10
@@ -52,7 +52,7 @@ class RelativeError(NamedTuple):
 
     ``error`` is the estimate, ``margin`` the half-width of its 99 % interval, and
     ``gain`` the gain of the model, output over input. ``resolution`` (Hz) is the
-    spacing of all lines, excited or not.
+    spacing of all lines, excited or not, and ``averages`` the number of averages.
     """
 
     frequency: np.ndarray
@@ -60,6 +60,12 @@ class RelativeError(NamedTuple):
     margin: np.ndarray
     gain: np.ndarray
     resolution: float
+    averages: float
+
+    @property
+    def deviation(self) -> np.ndarray:
+        """Estimated standard deviation of the error [lines]."""
+        return self.margin / deviations(self.averages, OUTSIDE)
 
     @property
     def upper(self) -> np.ndarray:
@@ -68,13 +74,30 @@ class RelativeError(NamedTuple):
 
     @property
     def sure(self) -> np.ndarray:
-        """Whether the error [lines] is above 0 with certainty, at all lines at once."""
-        return self.error > 2.0 * self.margin
+        """Whether the error [lines] is above 0 with certainty, at all lines at once.
+
+        It exceeds twice its interval, which leaves room for leakage, and the interval
+        that holds at all lines at once, which is wider after few averages.
+        """
+        chance = OUTSIDE / max(self.error.size, 1)
+        at_once = deviations(self.averages, chance) * self.deviation
+        return self.error > np.maximum(2.0 * self.margin, at_once)
 
     @property
     def lower(self) -> np.ndarray:
         """Lower end of the interval [lines], at least 0."""
         return np.maximum(self.error - self.margin, 0.0)
+
+
+def deviations(averages: float, chance: float) -> float:
+    """Return how many of its deviations an error exceeds with probability ``chance``.
+
+    The deviation of a complex response is itself estimated, from the scatter of n
+    ``averages``: the squared ratio follows the F distribution with 2 and 2 (n - 1)
+    degrees of freedom (Bendat and Piersol, Random Data, 4th ed., 9.2).
+    """
+    freedom = max(averages - 1.0, 0.5)
+    return math.sqrt(freedom * (chance ** (-1.0 / freedom) - 1.0))
 
 
 def relative_error(record: Record, run: np.ndarray, part: slice) -> RelativeError:
@@ -104,12 +127,14 @@ def relative_error(record: Record, run: np.ndarray, part: slice) -> RelativeErro
     resolution = 1.0 / ((period or segment) * record.dt)
     lines = _places(own, resolution)
     kept = slice(None) if period else _stands_out(own.power, lines)
+    factor = deviations(own.averages, OUTSIDE)
     return RelativeError(
         residual.frequency[kept],
         (np.abs(residual.response) / size)[kept],
-        (CONFIDENCE * np.sqrt(residual.variance) / size)[kept],
+        (factor * np.sqrt(residual.variance) / size)[kept],
         size[kept],
         resolution,
+        own.averages,
     )
 
 
@@ -137,9 +162,14 @@ def _closed_loop_error(
     kept = np.isin(ratio.frequency, own.frequency[excited])
     lines = np.isin(own.frequency, ratio.frequency[kept])
     size = np.maximum(np.abs(own.response[lines]), np.finfo(float).tiny)
-    margin = CONFIDENCE * np.sqrt(ratio.variance[kept] + own.variance[lines] / size**2)
+    deviation = np.sqrt(ratio.variance[kept] + own.variance[lines] / size**2)
     return RelativeError(
-        ratio.frequency[kept], np.abs(ratio.response[kept]), margin, size, resolution
+        ratio.frequency[kept],
+        np.abs(ratio.response[kept]),
+        deviations(own.averages, OUTSIDE) * deviation,
+        size,
+        resolution,
+        own.averages,
     )
 
 

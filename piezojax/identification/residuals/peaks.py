@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from pydantic import BaseModel
 
-from .bound import CONFIDENCE, RelativeError
+from .bound import RelativeError
 
 LEAST = 1.0
 """Least relative error of a peak: the error equals the gain of the model."""
@@ -97,5 +97,5 @@ def _level(found: RelativeError, side: np.ndarray) -> float:
     mean power of the noise is subtracted.
     """
     clear = side & (found.margin <= CLEAR * found.margin[side].min())
-    noise = 2.0 * (found.margin[clear] / CONFIDENCE) ** 2
+    noise = 2.0 * found.deviation[clear] ** 2
     return float(np.median(np.sqrt(np.maximum(found.error[clear] ** 2 - noise, 0.0))))
