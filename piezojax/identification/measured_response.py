@@ -8,8 +8,9 @@ from pydantic import BaseModel
 
 from .estimators.line_noise import smoothed
 from .estimators.local_polynomial import local_polynomial, periodic_local_polynomial
+from .estimators.loop_response import joint_response
 from .estimators.robust import LineEstimates, robust_response, steady_response
-from .estimators.welch import segment_length, spectral_response
+from .estimators.welch import SpectralResponse, segment_length, spectral_response
 from .records.record import Record
 from .records.response import FrequencyResponse
 
@@ -24,8 +25,8 @@ CERTAIN = 3.0
 """Standard errors by which the total variance must exceed the noise."""
 
 RESPONSE_METHODS = {
-    "welch": "averaged spectra of any record, with coherence; its band does not "
-    "include leakage",
+    "welch": "averaged spectra of any record, with coherence, in a closed loop of the "
+    "responses to its excitation; its band does not include leakage",
     "local_polynomial": "any record, or periodic with a transient; no leakage",
     "robust": "periods of multisines in steady state; several realisations tell "
     "nonlinear distortion from noise",
@@ -83,8 +84,12 @@ def measure_responses(
 
     Records with the same rms amplitude of the input (``ALIKE``) are realisations of one
     response: they are averaged. Two or more periodic ones separate nonlinear distortion
-    from noise. Raises ValueError for an unknown method, records of several inputs or
-    outputs or of different sample times, units or periods, and as the methods do.
+    from noise. In a closed loop welch takes the ratio of the responses to reference and
+    dither, which noise does not bias.
+
+    Raises ValueError for an unknown method, records of several inputs or outputs or of
+    different sample times, units or periods, a local polynomial of a closed loop
+    without a period, and as the methods do.
     """
     if settings.method not in RESPONSE_METHODS:
         raise ValueError(
@@ -129,6 +134,14 @@ def _check(records: Sequence[Record], settings: ResponseSettings) -> None:
             "welch does not use a period: local_polynomial and robust do, without "
             "leakage"
         )
+    if settings.method == "local_polynomial" and period is None:
+        for record in records:
+            if record.closed_loop:
+                raise ValueError(
+                    f"{record.source}: local_polynomial takes the input as free of "
+                    "noise, and in a closed loop it is not: use welch, or a periodic "
+                    "reference and its --period"
+                )
 
 
 def _split(record: Record, settings: ResponseSettings) -> list[Record]:
@@ -137,14 +150,7 @@ def _split(record: Record, settings: ResponseSettings) -> list[Record]:
     if count == 1:
         return [record]
     size = record.samples // count
-    return [
-        replace(
-            record,
-            inputs=record.inputs[i * size : (i + 1) * size],
-            outputs=record.outputs[i * size : (i + 1) * size],
-        )
-        for i in range(count)
-    ]
+    return [record.during(slice(i * size, (i + 1) * size)) for i in range(count)]
 
 
 def _measured(
@@ -188,10 +194,7 @@ def _by_welch(
     records: Sequence[Record], settings: ResponseSettings, properties: dict
 ) -> FrequencyResponse:
     size = settings.segment or segment_length(min(r.samples for r in records))
-    each = [
-        spectral_response(r.input, r.output, r.dt, segment=size, least=1e-4)
-        for r in records
-    ]
+    each = [_of_welch(record, size) for record in records]
     # Variance of a regression with one unknown: divide by one average less.
     estimates = [
         LineEstimates(
@@ -207,6 +210,16 @@ def _by_welch(
     if len({one.frequency.size for one in each}) == 1:
         coherence = np.mean([one.coherence for one in each], axis=0)
     return _averaged(estimates, properties | {"coherence": coherence})
+
+
+def _of_welch(record: Record, segment: int) -> SpectralResponse:
+    """Return the response of the stage, in a closed loop from its excitation."""
+    input, output, dt, least = record.input, record.output, record.dt, 1e-4
+    if record.closed_loop:
+        return joint_response(
+            input, output, record.excitation, dt, segment=segment, least=least
+        )
+    return spectral_response(input, output, dt, segment=segment, least=least)
 
 
 def _averaged(each: Sequence[LineEstimates], properties: dict) -> FrequencyResponse:

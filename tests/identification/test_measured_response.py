@@ -1,8 +1,10 @@
 """Responses from records: variances and bands against Monte Carlo and closed forms."""
 
+import dataclasses
+
 import numpy as np
 import pytest
-from oracles import multisines
+from oracles import closed_loop, multisines
 from oracles.multisines import DT, LINES, PERIOD
 
 from piezojax.identification.estimators.local_polynomial import (
@@ -195,3 +197,60 @@ def _tone(lines):
     spectrum[lines] = np.exp(1j * np.arange(lines.size) ** 2)
     signal = np.tile(np.fft.irfft(spectrum, PERIOD), 3)
     return signal, 2.0 * signal
+
+
+# Closed loops
+
+
+def loop(seed, samples=20_000, size=0.02):
+    """Return the record of a loop with a binary reference and dither, and noise."""
+    draw = np.random.default_rng([8, seed])
+    r, d = (a * draw.choice([-1.0, 1.0], samples) for a in (0.2, 0.4))
+    noise = closed_loop.noise(draw, samples, size)
+    u, y = closed_loop.run(closed_loop.CONTROLLERS["PI with notch"], r, d, noise)
+    return Record(u, y, closed_loop.DT, reference=r, dither=d, source="loop")
+
+
+def test_welch_of_a_closed_loop_is_not_biased_by_its_noise():
+    record, welch = loop(1), ResponseSettings(method="welch", segment=512)
+    ((found, _),) = measure_responses([record], welch)
+    blind = dataclasses.replace(record, reference=None, dither=None)
+    ((naive, _),) = measure_responses([blind], welch)
+
+    def outside(one):
+        """Return the share of lines at which the truth is outside the 95 % band."""
+        kept = (one.frequency > 30.0) & (one.frequency < 3000.0)
+        kept &= np.abs(one.frequency - closed_loop.FREQUENCY) > 150.0
+        size = np.abs(closed_loop.stage_response(one.frequency))
+        return np.mean((np.abs(np.abs(one.values) - size) > one.band()[0])[kept])
+
+    assert outside(found) < 0.1
+    assert outside(naive) > 0.3
+
+
+def test_realisations_of_a_loop_are_cut_with_their_excitation():
+    record = loop(2, 8000, 0.002)
+    ((found, told),) = measure_responses(
+        [record], ResponseSettings(method="welch", realisations=2, segment=512)
+    )
+    halves = [record.during(part) for part in (slice(4000), slice(4000, None))]
+    ((again, _),) = measure_responses(
+        halves, ResponseSettings(method="welch", segment=512)
+    )
+    assert told.realisations == 2
+    np.testing.assert_array_equal(found.values, again.values)
+
+
+@pytest.mark.parametrize(
+    ("method", "reference", "message"),
+    [
+        ("local_polynomial", None, "loop: local_polynomial takes .* use welch, or"),
+        ("welch", np.ones(2000), "reference and dither never change"),
+    ],
+)
+def test_loops_that_a_method_does_not_take_are_refused(method, reference, message):
+    record = loop(3, 2000)
+    if reference is not None:
+        record = dataclasses.replace(record, reference=reference, dither=None)
+    with pytest.raises(ValueError, match=message):
+        measure_responses([record], ResponseSettings(method=method))
