@@ -30,6 +30,7 @@ from .records.parts import (
     check_compatible,
     check_train,
     longest_first,
+    longest_first_places,
     train_and_validation,
 )
 from .records.record import Record
@@ -94,7 +95,8 @@ class Fit:
 
     The outputs are in the units of the records. ``count`` is the number of fitted
     parameters. ``held`` are the dynamics that were not fitted, ``known`` is the plant
-    that was fitted again, if any.
+    that was fitted again, if any. ``driven`` are the numbers of the inputs that the
+    records drive, one each; it is empty if every record drives all inputs.
     """
 
     system: System
@@ -107,6 +109,7 @@ class Fit:
     count: int = 0
     held: HeldDynamics | None = None
     known: KnownPlant | None = None
+    driven: tuple[int, ...] = ()
 
     @property
     def plant(self) -> System:
@@ -141,7 +144,9 @@ class Fit:
     def about(self) -> About:
         """Origin of the fitted plant, for its file."""
         record = self.record
-        channels = {"input": record.input_units, "output": record.output_units}
+        driving = self._by_input
+        inputs = [unit for one, *_ in driving for unit in one.input_units]
+        channels = {"input": inputs, "output": record.output_units}
         units = {
             side if len(each) == 1 else f"{side} {i}": unit
             for side, each in channels.items()
@@ -155,9 +160,14 @@ class Fit:
             parameter_units=self._parameter_units(),
             input_ranges=[
                 (float(column.min()), float(column.max()))
-                for column in np.concatenate([one.inputs for one in self.records]).T
+                for records in driving
+                for column in np.concatenate([one.inputs for one in records]).T
             ],
-            input_slews=np.max([one.slews for one in self.records], axis=0).tolist(),
+            input_slews=[
+                float(slew)
+                for records in driving
+                for slew in np.max([one.slews for one in records], axis=0)
+            ],
             error_bound=None if residuals is None else residuals.error_bound,
             residual_rms=self.report.validation.each,
             standard_errors={
@@ -179,6 +189,13 @@ class Fit:
             "standard_errors": about.standard_errors | held.standard_errors(),
         }
         return about.model_copy(update=changed)
+
+    @property
+    def _by_input(self) -> list[list[Record]]:
+        """The records that drive the same inputs, in the order of the inputs."""
+        if not self.driven:
+            return [list(self.records)]
+        return [[self.records[i]] for i in np.argsort(self.driven)]
 
     def _parameter_units(self) -> dict[str, str]:
         """Return the units of the parameters of the System, by path.
@@ -243,6 +260,8 @@ def identify(
     longest if left out) and validated by its free run on ``validate`` (the rest if left
     out). A record without samples in ``validate`` is used for the fit only. Each of
     several records has its own zero of the sensor and its own initial state.
+    For ``state_space`` from records that are not periodic, each record drives one input
+    of the stage alone: the first record input 0, the second input 1, and so on.
     ``Fit.records`` are sorted by length, the longest first.
     Records are fitted as those of a closed loop if one has a reference or dither, or if
     ``options.closed_loop`` names an approach. Only ``output_error`` does so; the other
@@ -254,7 +273,7 @@ def identify(
     began, options = time.perf_counter(), options or Options()
     records = (records,) if isinstance(records, Record) else tuple(records)
     check_compatible(records)
-    records = longest_first(records)
+    given, records = records, longest_first(records)
     train, validate = train_and_validation(records[0].samples, train, validate)
     check_train(records, train)
     check_approach(records, options)
@@ -278,7 +297,17 @@ def identify(
             f"the method for {model!r} is for open loops; output_error fits a chain to "
             f"a record of a closed loop by {options.closed_loop}"
         )
-    estimate = chosen.estimate(model, records, train, options, progress or Silent())
+    estimate = chosen.estimate(
+        model,
+        given if chosen.in_turn else records,
+        train,
+        options,
+        progress or Silent(),
+    )
+    runs, driven = estimate.simulations, ()
+    if chosen.in_turn:
+        driven = longest_first_places(given)
+        runs = tuple(runs[i] for i in driven)
     shown = estimate.shown or shown_dynamics(records, train)
     feedback = ([], []) if estimate.closed_loop else feedback_warnings(records, train)
 
@@ -289,7 +318,6 @@ def identify(
             for text in check(record)
         ]
 
-    runs = estimate.simulations
     alarms = of_each(plausibility_warnings)
     if not estimate.closed_loop:
         alarms += of_each(partial(early_warnings, train=train))
@@ -340,6 +368,7 @@ def identify(
         estimate.parameter_count(),
         held,
         options.known,
+        driven,
     )
 
 

@@ -278,7 +278,8 @@ class Method(NamedTuple):
     """Summary, names of the ``models`` (none: chains of parts) and fit of a method.
 
     ``uses`` are the numbers of Options that change the fit, and ``closed_loop`` tells
-    whether it takes the approaches to a closed loop.
+    whether it takes the approaches to a closed loop. With ``in_turn`` each record
+    drives one input of the model, in the order of the records.
     """
 
     summary: str
@@ -286,6 +287,7 @@ class Method(NamedTuple):
     estimate: Callable[[str, Records, slice, Options, Progress], Estimate]
     uses: tuple[str, ...] = ()
     closed_loop: bool = False
+    in_turn: bool = False
 
 
 METHODS: dict[str, Method] = {
@@ -316,6 +318,7 @@ METHODS: dict[str, Method] = {
         ("state_space",),
         by_subspace,
         uses=("order", "window"),
+        in_turn=True,
     ),
     "frequency_response": Method(
         "least squares on the transfer matrix of periodic records",

@@ -19,7 +19,7 @@ from piezojax.dynamics import (
 from piezojax.hysteresis import (
     ColemanHodgdon,
 )
-from piezojax.identification import METHODS, Options, free_run
+from piezojax.identification import METHODS, Options, free_run, validate
 
 DT = 1e-3
 PERIOD = 512
@@ -106,6 +106,51 @@ def test_records_that_drive_one_channel_in_turn_are_stacked():
     found = np.asarray(fit.system.dc_gain())
     np.testing.assert_allclose(found, gains * sum(B) / (1 - sum(A)), rtol=0.05)
     assert len(fit.simulations) == 2
+
+
+GAINS = np.array([[1.0, 0.2], [-0.3, 2.0]])
+"""From input j to output i."""
+
+
+def driven(*inputs, **more):
+    """Return a record of a stage with ``GAINS`` under one or several inputs."""
+    outputs = [
+        sum(
+            answered(u, gain, 5 * i + j)
+            for j, (u, gain) in enumerate(zip(inputs, row, strict=True))
+        )
+        for i, row in enumerate(more.pop("gains", GAINS))
+    ]
+    return Record(np.transpose(inputs), np.transpose(outputs), DT, **more)
+
+
+@pytest.mark.parametrize("periods", [(4, 6), (6, 4)])
+def test_the_inputs_keep_the_order_of_the_records(periods):
+    records = [
+        driven(
+            (1.0 + 3.0 * j) * multisine(j, periods[j]),
+            gains=GAINS[:, [j]],
+            source=f"drives {j}",
+        )
+        for j in range(2)
+    ]
+    fit = identify(records, "state_space", options=Options(order=2))
+    found = np.asarray(fit.system.dc_gain())
+    np.testing.assert_allclose(found, GAINS * sum(B) / (1 - sum(A)), rtol=0.05)
+    # Records and runs are sorted, the inputs are not.
+    assert [one.samples for one in fit.records] == [6 * PERIOD, 4 * PERIOD]
+    assert fit.report.train.rmse < 10.0 * NOISE
+    about = fit.about
+    assert about.units == dict.fromkeys(("input 0", "input 1"), "V") | dict.fromkeys(
+        ("output 0", "output 1"), "um"
+    )
+    ranges = [(one.input.min(), one.input.max()) for one in records]
+    np.testing.assert_array_equal(about.input_ranges, ranges)
+    np.testing.assert_array_equal(about.input_slews, [r.slews[0] for r in records])
+    both = driven(multisine(4), 4.0 * multisine(5), source="both")
+    checked = validate(fit.system, about, both)
+    assert checked.report.alarms == []
+    assert checked.report.records[0].rmse < 20.0 * NOISE
 
 
 def test_records_of_one_stage_share_all_but_zero_and_initial_state():

@@ -48,7 +48,7 @@ def by_subspace(
     options: Options,
     progress: Progress,
 ) -> Estimate:
-    """Fit a state-space model to records that each drive one input channel in turn.
+    """Fit a state-space model to records that each drive one input, in their order.
 
     Each channel has its MAP estimate of the Hankel-Toeplitz model; the models of the
     channels are stacked (chapter 6).

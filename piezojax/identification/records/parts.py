@@ -1,15 +1,21 @@
 """Records that are fitted together, and their parts to fit and to validate on."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 
 import numpy as np
 
 from .record import Record
 
 
-def longest_first(records: Iterable[Record]) -> tuple[Record, ...]:
+def longest_first(records: Sequence[Record]) -> tuple[Record, ...]:
     """Return ``records`` sorted by length; those of equal length keep their order."""
-    return tuple(sorted(records, key=lambda record: -record.samples))
+    return tuple(records[i] for i in longest_first_places(records))
+
+
+def longest_first_places(records: Sequence[Record]) -> tuple[int, ...]:
+    """Return the places of ``longest_first`` records in ``records``."""
+    places = range(len(records))
+    return tuple(sorted(places, key=lambda i: -records[i].samples))
 
 
 def check_compatible(records: tuple[Record, ...]) -> None:
