@@ -37,7 +37,8 @@ UNEXPLAINED, INDEPENDENT = 0.01, 25
 """Assumed rms error of a model, as a share of the range of the output, and assumed
 number of independent samples of it. Both set the weight of the prior."""
 
-GAIN, DELAY = "calibration.gain", "delay"
+CALIBRATION, DELAY = "calibration", "delay"
+GAIN = f"{CALIBRATION}.gain"
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,9 @@ class KnownPlant:
     """A ``system`` and its origin ``about``, which names its fitted parameters.
 
     Its linear dynamics, the delay included, are not fitted again if they are ``held``.
-    Raises ValueError for a plant without fitted parameters.
+    A plant without a calibration, as from a frequency response, gets one. Raises
+    ValueError for a plant without fitted parameters, and for one that is no chain of
+    named parts.
     """
 
     system: System
@@ -58,6 +61,17 @@ class KnownPlant:
                 "the plant has no fitted parameters that could be fitted again: "
                 "identify it from a record first"
             )
+        system = self.system
+        if not (isinstance(system, Series) and system.names):
+            raise ValueError(
+                f"the plant, a {type(system).__name__}, has no named parts, and "
+                "only a chain of named parts can be fitted again: identify one, as "
+                "coleman_hodgdon+lag"
+            )
+        if CALIBRATION not in system.names:
+            parts, names = (*system.parts, Affine()), (*system.names, CALIBRATION)
+            chain = Series(parts, names)
+            object.__setattr__(self, "system", chain)
 
     @property
     def model(self) -> str:
@@ -115,7 +129,12 @@ class KnownPlant:
         return dataclasses.replace(self, system=replace(fitted, others), held=True)
 
     def widened(self, about: About) -> About:
-        """Return the origin ``about`` of a new fit, with all that the inputs cover."""
+        """Return the origin ``about`` of a new fit, with all that the inputs cover.
+
+        A plant from a frequency response covers no known range.
+        """
+        if not self.about.input_ranges:
+            return about
         pairs = zip(about.input_ranges, self.about.input_ranges, strict=True)
         ranges = [(min(a[0], b[0]), max(a[1], b[1])) for a, b in pairs]
         # The known slews are empty in a file of an earlier version.

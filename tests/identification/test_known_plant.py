@@ -9,7 +9,7 @@ from jax import jacfwd
 
 import piezojax as pj
 from piezojax.core.paths import get, parameters, replace
-from piezojax.dynamics import FirstOrderLag, FractionalDelay, Mode
+from piezojax.dynamics import FirstOrderLag, FractionalDelay, Mode, Modes
 from piezojax.hysteresis import PrandtlIshlinskii
 from piezojax.identification import Record, identify
 from piezojax.identification.estimators.error_problem import problem_of
@@ -232,6 +232,28 @@ def test_the_range_of_the_known_record_remains(unchanged):
 def test_a_plant_without_fitted_parameters_is_refused():
     with pytest.raises(ValueError, match=r"no fitted parameters .*identify it"):
         known(errors={})
+
+
+def test_a_plant_from_a_frequency_response_is_fitted_again():
+    """It has no calibration, and nothing tells which voltages it covers."""
+    system = pj.series(gain=pj.Affine(0.06), dynamics=Modes([800.0], [0.03], DT))
+    errors = {"dynamics.frequency.0": 0.1, "dynamics.damping.0": 1e-4}
+    start = KnownPlant(system, pj.About(standard_errors=errors, small_motions=True))
+    changed = {"gain.gain": 0.07, "gain.offset": 0.3, "dynamics.frequency.0": 700.0}
+    one = record(replace(system, changed), 30.0)
+    fit = identify(one, start.model, options=Options(known=start))
+    assert fit.report.train.rmse < 5e-3
+    frequency = fit.report.parameters["dynamics.frequency.0"].value
+    assert frequency == pytest.approx(700.0, rel=0.01)
+    assert fit.about.input_ranges == [(one.input.min(), one.input.max())]
+    assert fit.about.input_slews == pytest.approx(one.slews)
+
+
+def test_a_plant_that_is_no_chain_is_refused():
+    about = pj.About(standard_errors={"frequency": 1.0})
+    for system in (Mode(800.0, 0.03, DT), pj.Affine(0.06) >> Mode(800.0, 0.03, DT)):
+        with pytest.raises(ValueError, match="only a chain of named parts can be fit"):
+            KnownPlant(system, about)
 
 
 def test_the_model_is_named_by_its_parts():
