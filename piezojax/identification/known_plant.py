@@ -35,7 +35,7 @@ is smaller than its standard deviation, in these deviations."""
 
 UNEXPLAINED, INDEPENDENT = 0.01, 25
 """Assumed rms error of a model, as a share of the range of the output, and assumed
-number of independent samples of it. Both set the weight of the prior."""
+number of independent samples of it. Both set the scale of the prior."""
 
 CALIBRATION, DELAY = "calibration", "delay"
 GAIN = f"{CALIBRATION}.gain"
@@ -104,8 +104,8 @@ class KnownPlant:
         span = float(np.average(spans**-2.0, weights=sizes) ** -0.5)
         explained = UNEXPLAINED * span
         widths = np.asarray(space.upper - space.lower)
-        weights = widths / np.array(list(deviations.values()))
-        prior = Prior(known, explained / math.sqrt(INDEPENDENT) * weights)
+        shares = np.array(list(deviations.values())) / widths
+        prior = Prior(known, shares, explained / math.sqrt(INDEPENDENT))
         shown = dynamics_of(best)
         resonances = [mode.frequency for mode in shown.modes]
         moved = _at_resonances(system, ranges, resonances)

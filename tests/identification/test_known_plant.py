@@ -15,6 +15,7 @@ from piezojax.identification import Record, identify
 from piezojax.identification.estimators.error_problem import problem_of
 from piezojax.identification.estimators.estimate import Options
 from piezojax.identification.estimators.free_runs import free_run
+from piezojax.identification.estimators.output_error import Optimum, values_and_errors
 from piezojax.identification.known_plant import CHANGED, KnownPlant
 
 DT = 1e-4
@@ -130,6 +131,44 @@ def test_one_standard_deviation_costs_a_hundredth_of_the_range():
     extra = np.asarray(problem.residuals(jnp.asarray(moved)))[-len(paths) :]
     assert extra[at] == pytest.approx(0.01 * one.span / np.sqrt(25), rel=1e-6)
     assert np.count_nonzero(extra) == 1
+
+
+def standard_error(start, one, prior=True):
+    """Return the standard error of the mode's frequency, at the known values."""
+    shape = start.structure([one])
+    shape = shape.without(shape.own)
+    known = shape.prior.known
+    shape = shape if prior else shape._replace(prior=None)
+    problem = problem_of(shape, [one], slice(0, one.samples))
+    loss = float(np.sum(problem.residuals(jnp.asarray(known)) ** 2))
+    _, errors = values_and_errors(Optimum(problem, known[None], np.array([loss]), True))
+    return errors[problem.space.paths.index("dynamics.frequency")]
+
+
+def mode_record(drive):
+    """Return the record of a known mode without offset, and the known plant."""
+    system = pj.series(dynamics=Mode(1000.0, 0.01, DT), calibration=pj.Affine(0.06))
+    noise = 2e-3 * np.random.default_rng(4).standard_normal(drive.size)
+    output = np.asarray(free_run(system, jnp.asarray(drive), float(drive[0])))
+    errors = {"dynamics.frequency": 30.0, "dynamics.damping": 1e-3}
+    return known(errors, system), Record(drive, output + noise, DT)
+
+
+@pytest.mark.parametrize("samples", [3000, 12_000])
+def test_a_record_that_says_nothing_leaves_the_error_of_a_parameter(samples):
+    # It begins without a jump of its slope, which would excite the mode.
+    start, one = mode_record(np.cos(2.0 * np.pi * 2.0 * DT * np.arange(samples)))
+    expected = np.hypot(30.0, CHANGED * 1000.0)
+    assert standard_error(start, one) == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize("samples", [3000, 12_000])
+def test_a_record_that_shows_a_parameter_gives_its_error(samples):
+    random = np.random.default_rng(3)
+    start, one = mode_record(10.0 * random.standard_normal(samples))
+    alone = standard_error(start, one, prior=False)
+    assert alone < 1.0
+    assert standard_error(start, one) == pytest.approx(alone, rel=1e-3)
 
 
 @pytest.mark.parametrize(("held", "factor"), [(False, 1.0), (True, 4.0)])

@@ -88,8 +88,9 @@ def test_the_weight_is_that_of_one_independent_sample(shape, records, monkeypatc
 
 
 def test_a_prior_never_grows():
-    first, later = (Prior(np.zeros(2), np.array(w)) for w in ([3.0, 0.0], [5.0, 0.0]))
-    none = Prior(*np.zeros((2, 2)))
+    spread = np.array([0.5, np.inf])
+    none, first, later = (Prior(np.zeros(2), spread, s) for s in (0.0, 1.5, 2.5))
+    np.testing.assert_array_equal(first.weights, [3.0, 0.0])
     np.testing.assert_array_equal(fits._lighter(none, later).weights, later.weights)
     np.testing.assert_array_equal(fits._lighter(first, later).weights, first.weights)
     np.testing.assert_array_equal(fits._lighter(later, first).weights, first.weights)
@@ -132,7 +133,7 @@ def test_the_prior_follows_the_errors_until_they_settle():
 
 
 def test_the_errors_are_those_of_the_records_alone(optimum):
-    assert not np.asarray(optimum.problem.prior).any()
+    assert not np.asarray(optimum.problem.prior.weights).any()
     _, errors = fits.values_and_errors(optimum)
     paths = optimum.problem.space.paths
     found = dict(zip(paths, errors, strict=True))

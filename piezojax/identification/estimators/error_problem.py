@@ -16,7 +16,7 @@ from .approach import run_after
 from .free_runs import from_rest
 from .linear_start import Start, most_likely, start_columns
 from .noise_model import NOISE_ORDER, independent, whitening_filter
-from .structure import Structure
+from .structure import Prior, Structure
 
 
 class Problem(eqx.Module):
@@ -36,7 +36,7 @@ class Problem(eqx.Module):
     plain: Float[Array, ""]
     whitening: Float[Array, " taps"]
     share: Float[Array, ""]
-    prior: Float[Array, "2 known"]
+    prior: Prior | None = None
 
     def errors(self, unit: Float[Array, " n"]) -> Float[Array, "records samples"]:
         """Return the errors of the free run of every record."""
@@ -104,9 +104,8 @@ class Problem(eqx.Module):
         counted = [(self.plain * weights * error)[:, ::every], unlikely]
         if self.whitening.size:
             counted.append((self.share * weights * self.whitened(error))[:, ::every])
-        if self.prior.size:
-            known, weights = self.prior
-            counted.append(weights * (unit - known))
+        if self.prior is not None:
+            counted.append(self.prior.weights * (unit - self.prior.known))
         return jnp.concatenate([part.ravel() for part in counted])
 
     def effect_of(
@@ -215,7 +214,7 @@ def problem_of(
         as_array(1.0),
         as_array(structure.whitening),
         as_array(0.0),
-        as_array(np.stack(structure.prior) if structure.prior else np.zeros((2, 0))),
+        jax.tree.map(as_array, structure.prior),
     )
 
 

@@ -182,7 +182,8 @@ def output_error(
         starts = np.where(restarted, starts[:1], best)
     problem = problem_of(structure, records, train, drives)
     cautious = several and bool(structure.vague) and not noise_model
-    none = prior = Prior(*np.zeros((2, starts.shape[1])))
+    nothing = np.zeros(starts.shape[1]), np.full(starts.shape[1], np.inf)
+    none = prior = Prior(*nothing, 0.0)
     if cautious:
         problem = _with_prior(problem, none)  # of the final size, to compile once
     if noise_model:
@@ -267,17 +268,18 @@ def output_error(
 
 
 def _with_prior(problem: Problem, prior: Prior) -> Problem:
-    return eqx.tree_at(lambda p: p.prior, problem, as_array(np.stack(prior)))
+    arrays = jax.tree.map(as_array, prior)
+    return eqx.tree_at(
+        lambda p: p.prior, problem, arrays, is_leaf=lambda leaf: leaf is None
+    )
 
 
 def _lighter(prior: Prior, later: Prior) -> Prior:
-    """Return ``later``, with at most the weights of ``prior`` if this has any.
+    """Return ``later``, with at most the scale of ``prior`` if this has any.
 
     A prior that is too heavy raises the errors, and these must not make it heavier.
     """
-    if not prior.weights.any():
-        return later
-    return later._replace(weights=np.minimum(prior.weights, later.weights))
+    return later._replace(scale=min(prior.scale or np.inf, later.scale))
 
 
 def _first_guess(structure: Structure, problem: Problem, unit: np.ndarray) -> Prior:
@@ -289,7 +291,7 @@ def _first_guess(structure: Structure, problem: Problem, unit: np.ndarray) -> Pr
     rms, independent = problem.spread(as_array(unit))
     spread = [structure.vague.get(path, np.inf) for path in structure.space.paths]
     known = structure.starts[0] if structure.guess is None else structure.guess
-    return Prior(known, rms / (np.array(spread) * np.sqrt(independent)))
+    return Prior(known, np.array(spread), rms / float(np.sqrt(independent)))
 
 
 def _inside(units: np.ndarray) -> np.ndarray:
@@ -365,10 +367,19 @@ def values_and_errors(optimum: Optimum) -> tuple[np.ndarray, list[float | None]]
     """Return the parameters of the best point and their standard errors.
 
     The errors are those of Gauss-Newton: the covariance is s^2 (J'J)^-1, for white
-    residuals. A parameter in a direction that the record does not determine has the
-    error None.
+    residuals. A prior that is not switched off adds its own information, that of its
+    deviations. A parameter in a direction that neither the record nor a prior
+    determines has the error None.
     """
     problem, free = optimum.problem, unsquash(as_array(optimum.units))
+    prior, loss = problem.prior, optimum.losses[0]
+    if prior is not None and not float(prior.scale):
+        prior = None
+    if prior is not None:
+        # Its rows have the scale of the errors of the model, not of white noise.
+        off = prior.weights * (optimum.units[0] - prior.known)
+        loss -= float(np.sum(np.asarray(off) ** 2))
+        problem = _with_prior(problem, prior._replace(scale=0.0))
     best = as_array(np.asarray(free)[0])
     values, slopes = map(np.asarray, _parameters(problem, best))
     if optimum.weights:
@@ -379,7 +390,11 @@ def values_and_errors(optimum: Optimum) -> tuple[np.ndarray, list[float | None]]
     slopes = np.where(slopes == 0.0, 1.0, slopes)
     kinds = 2 if problem.whitening.size and float(problem.plain) else 1
     counted = kinds * int(np.sum(np.asarray(problem.weights) > 0))
-    variance = optimum.losses[0] / max(counted - values.size, 1)
+    variance = loss / max(counted - values.size, 1)
+    if prior is not None:
+        _, tilt = jax.jvp(squash, (best,), (jnp.ones_like(best),))
+        own = np.asarray(tilt / prior.deviations) ** 2
+        curvature = curvature + variance * np.diag(own)
     return values, standard_errors(curvature / np.outer(slopes, slopes), variance)
 
 

@@ -14,12 +14,23 @@ from .approach import BEFORE, Before
 class Prior(NamedTuple):
     """Normal prior of the parameters of a structure, in the unit box.
 
-    ``known`` [n] are the most likely values. The differences from them are multiplied
-    by ``weights`` [n] (unit of the output); their squares add to the mean square error.
+    ``known`` [n] are the most likely values, ``deviations`` [n] the standard deviations
+    of the parameters, infinite for one that the prior does not hold. ``scale`` (unit of
+    the output) is the rms of the errors over the root of the number of independent
+    ones; 0 switches the prior off.
     """
 
     known: np.ndarray
-    weights: np.ndarray
+    deviations: np.ndarray
+    scale: float
+
+    @property
+    def weights(self) -> np.ndarray:
+        """Factors [n] of the differences from ``known`` (unit of the output).
+
+        The squares of the products add to the mean square error.
+        """
+        return self.scale / self.deviations
 
 
 def distinct(starts: np.ndarray) -> np.ndarray:
@@ -91,7 +102,10 @@ class Structure(NamedTuple):
         ranges = self.space.ranges()
         kept = {path: bounds for path, bounds in ranges.items() if path not in paths}
         columns = [path in kept for path in ranges]
-        prior = self.prior and Prior(*(each[columns] for each in self.prior))
+        prior = self.prior
+        if prior is not None:
+            own = prior.known[columns], prior.deviations[columns]
+            prior = Prior(*own, prior.scale)
         # Starts that differed only in the fixed parameters are one.
         starts = distinct(self.starts[:, columns])
         guess = None if self.guess is None else self.guess[columns]
