@@ -119,6 +119,7 @@ def _by_output_error(
         value = float(get(system, OFFSET)) + zero
         system, runs = replace(system, {OFFSET: value}), (runs[0] + zero,)
         named[OFFSET] = FittedParameter(value=value, standard_error=None)
+    outside = 0 if optimum.weights is None else round(optimum.weights.freedom)
     return Estimate(
         system,
         runs,
@@ -126,6 +127,7 @@ def _by_output_error(
         [*found.warnings, *warnings],
         shape.order,
         bool(hystereses(shape.system)),
+        count=len(named) + outside,
         closed_loop=found.text,
         shown=shown,
     )

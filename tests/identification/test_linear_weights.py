@@ -12,6 +12,7 @@ from oracles.preisach import Lines
 from piezojax.core.paths import get, replace
 from piezojax.core.space import squash, unsquash
 from piezojax.hysteresis import preisach
+from piezojax.identification import Options, identify
 from piezojax.identification.chain import structure
 from piezojax.identification.estimators.approach import TURNS
 from piezojax.identification.estimators.error_problem import at_starts, problem_of
@@ -121,6 +122,13 @@ def test_two_records_determine_a_density_and_the_lag_behind_it(records):
     _, (run,), _ = starts_of(found.system, records[2:], slice(0, SAMPLES))
     error = np.std(run[:, 0] - records[2].output)
     assert error < 0.003 * np.ptp(records[2].output)
+
+
+def test_the_weights_that_the_records_determine_count_as_parameters(records):
+    fit = identify(records[:1], MODEL, options=Options(steps=2))
+    (text,) = [text for text in fit.report.warnings if "weights of the hys" in text]
+    known, _ = map(int, re.findall(r"\d+", text))
+    assert fit.count == len(fit.report.parameters) + known
 
 
 def test_one_record_has_a_past_too(records):

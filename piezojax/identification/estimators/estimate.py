@@ -86,7 +86,8 @@ class Estimate(NamedTuple):
 
     ``order`` is the number of parameters of linear dynamics that the records had to
     excite. ``hysteresis`` is True if the records also had to hold full cycles.
-    ``count`` is the number of fitted parameters if ``parameters`` does not name all.
+    ``count`` is the number of fitted parameters if ``parameters`` does not name all;
+    of weights it counts those that the records determine.
     ``closed_loop`` says how a record of a closed loop was fitted. ``shown`` are the
     linear dynamics that showed in the fit, if it looked at them again.
     """
