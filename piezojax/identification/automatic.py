@@ -92,7 +92,8 @@ def automatic(
     Those within a factor of ``CLOSE`` of the best are fitted longer before they are
     compared. The fits use the first samples of a long record (``leading``), those to a
     single one also a lower sampling rate if it resolves the resonances and the input.
-    With ``dynamics``, which are held, the chain has no other dynamics.
+    With ``dynamics``, which are held, the chain has no other dynamics; the rate is not
+    lowered if they exist at one rate only. Raises ValueError if no fit succeeds.
     """
     records = [record, *beside]
     name, begun = hysteresis_for(records, progress, dynamics)
@@ -115,6 +116,7 @@ def hysteresis_for(
     """Return the name of the hysteresis that fits ``records`` best.
 
     Bounds, and the dynamics if they are not held, are derived from the first record.
+    Raises the ValueError of the first fit if all fits fail.
     """
     if records[0].samples < LEAST:
         return Chosen(HYSTERESES[0], None)
@@ -125,9 +127,27 @@ def hysteresis_for(
     ]
     if others := records[1:]:
         return _for_several(records[0], others, progress, dynamics)
-    every = _slowing(records[0])
-    slow = _slowed(records[0], every)
-    return Chosen(_best(HYSTERESES, lambda name: _error(name, slow, dynamics)), None)
+    record, failed = records[0], []
+    if dynamics is None or dynamics.any_rate:
+        record = _slowed(record, _slowing(record))
+
+    def error(name: str) -> float:
+        """Return the error of a model, infinite if its fit fails."""
+        try:
+            return _error(name, record, dynamics)
+        except ValueError as why:
+            failed.append(why)
+            return np.inf
+
+    best = _best(HYSTERESES, error)
+    _require_any(failed, HYSTERESES)
+    return Chosen(best, None)
+
+
+def _require_any(failed: Sequence[ValueError], names: Sequence[str]) -> None:
+    """Raise the first error if the fit of every model of ``names`` has failed."""
+    if len(failed) == len(names):
+        raise failed[0]
 
 
 def _best(names: Sequence[str], error: Callable[[str], float]) -> str:
@@ -157,6 +177,8 @@ def _for_several(
             plays = seen_again(chains[PLAYS], records, whole, progress, looks=LOOKS)
             shown, rough = plays.shown, plays.fit
 
+    failed: list[ValueError] = []
+
     def fit(shape: Structure, begun: Optimum | None, passes: int) -> Optimum | None:
         if shown is not None:
             shape = shape._replace(whitening=())  # the dynamics are known already
@@ -170,13 +192,15 @@ def _for_several(
                 passes=passes,
                 begun=begun,
             )
-        except ValueError:
+        except ValueError as why:
+            failed.append(why)
             return None
 
     fits = {}
     for name, chain in chains.items():
         shape = structure(chain, first, dynamics, beside=beside, shown=shown)
         fits[name] = fit(shape, rough, PASSES)
+    _require_any(failed, EVERY)
 
     def error(name: str) -> float:
         """Return the rms error of a fit, infinite if it failed.
@@ -251,16 +275,16 @@ def _slowed(record: Record, every: int) -> Record:
 def _error(name: str, record: Record, dynamics: HeldDynamics | None) -> float:
     """Return the error of the model ``name`` after a short fit to ``record``.
 
-    It is the standard deviation of the free-run error. It is infinite if the fit fails,
-    or if the fitted hysteresis has no inverse over the range of the input, because
-    controllers need the inverse.
+    It is the standard deviation of the free-run error. It is infinite if the fitted
+    hysteresis has no inverse over the range of the input, because controllers need the
+    inverse. Raises ValueError if the fit fails.
     """
     chain = _chain_of(name, [record], dynamics)
     every = slice(0, record.samples)
+    system = output_error(
+        structure(chain, record, dynamics), [record], every, steps=STEPS
+    ).system
     try:
-        system = output_error(
-            structure(chain, record, dynamics), [record], every, steps=STEPS
-        ).system
         hystereses(system)[0].inverse(record.input.min(), record.input.max())
     except ValueError:
         return np.inf

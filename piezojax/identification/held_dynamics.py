@@ -52,6 +52,12 @@ class HeldDynamics:
     about: About
     source: str
 
+    @property
+    def any_rate(self) -> bool:
+        """Whether all parts exist at any sample time."""
+        kinds = (Affine, Delay, *CONTINUOUS)
+        return all(isinstance(part, kinds) for part in self.parts.values())
+
     def at(self, dt: float) -> dict[str, System]:
         """Return the parts at the sample time ``dt`` (s) of a record.
 

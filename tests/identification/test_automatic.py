@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import piezojax.identification.automatic as automatic
+from piezojax.core.about import About
+from piezojax.dynamics import ARMA, Mode
 from piezojax.identification.automatic import (
     DENSITY,
     EVERY,
@@ -18,6 +20,7 @@ from piezojax.identification.automatic import (
 from piezojax.identification.estimators.output_error import Optimum
 from piezojax.identification.estimators.resonances import LinearDynamics
 from piezojax.identification.estimators.structure import Structure
+from piezojax.identification.held_dynamics import HeldDynamics
 from piezojax.identification.records.record import Record
 from piezojax.identification.second_sight import Seen
 
@@ -57,6 +60,10 @@ def test_the_delay_remains_one_sample_of_the_record(every):
     later = record.output[1:][inside] - record.input[:-1][inside]
     assert np.abs(later).max() < 2e-3
     assert record.dt == every * DT
+
+
+def several():
+    return [record_of(CYCLES), record_of(0.9 * CYCLES)]
 
 
 CURVE, PLAYS, FRICTIONS = FROM_SEVERAL
@@ -144,6 +151,55 @@ def test_longer_fits_decide_between_models_whose_first_fits_are_close(
     assert errors == {name: [] for name in EVERY}
 
 
+def held(part):
+    """Return linear dynamics that are held in a fit."""
+    return HeldDynamics({"dynamics": part}, DT, None, About(), "model.json")
+
+
+@pytest.mark.parametrize(
+    ("dynamics", "slowed"),
+    [
+        (None, True),
+        (held(Mode(800.0, 0.02, DT)), True),
+        (held(ARMA((0.5,), (0.5,))), False),
+    ],
+)
+def test_dynamics_of_one_rate_are_tried_at_that_rate(dynamics, slowed, monkeypatch):
+    rates = []
+
+    def error(name, record, dynamics):
+        if dynamics is not None:
+            dynamics.at(record.dt)  # raises ValueError at another rate
+        rates.append(record.dt)
+        return {PLAYS: 1.0}.get(name, 10.0)
+
+    monkeypatch.setattr(automatic, "_error", error)
+    chosen = automatic.hysteresis_for([record_of(CYCLES)], dynamics=dynamics)
+    assert chosen.model == PLAYS
+    assert np.all(np.array(rates) > DT) == slowed
+
+
+@pytest.mark.parametrize("records", [[record_of(CYCLES)], several()])
+def test_the_choice_fails_if_every_fit_fails(records, monkeypatch):
+    def failed(*_, **__):
+        raise ValueError("no start led to a finite simulation")
+
+    monkeypatch.setattr(automatic, "seen_again", failed)
+    monkeypatch.setattr(automatic, "output_error", failed)
+    with pytest.raises(ValueError, match="no start led to a finite simulation"):
+        automatic.hysteresis_for(records)
+
+
+def test_a_model_whose_fit_fails_is_not_chosen(monkeypatch):
+    def error(name, record, dynamics):
+        if name == CURVE:
+            raise ValueError("no start led to a finite simulation")
+        return 10.0
+
+    monkeypatch.setattr(automatic, "_error", error)
+    assert automatic.hysteresis_for([record_of(CYCLES)]).model == PLAYS
+
+
 def named(chain, *_, **__):
     """Return an empty structure that holds the name of its hysteresis."""
     return Structure(chain.partition("+")[0], None, np.zeros((1, 0)))
@@ -159,7 +215,3 @@ def fitting(error):
         return Optimum(None, None, np.array([found**2]), finished=True)
 
     return output_error
-
-
-def several():
-    return [record_of(CYCLES), record_of(0.9 * CYCLES)]
