@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -13,6 +14,7 @@ from pydantic import BaseModel
 from ..core.about import About
 from ..core.error_bound import ErrorBound
 from ..core.system import System, accepts, rest_output
+from ..dynamics.linearise import sample_time
 from .estimators.free_runs import first_covering
 from .estimators.projection import excited_columns
 from .estimators.start_search import start_of
@@ -146,7 +148,8 @@ def validate(
     records = (records,) if isinstance(records, Record) else tuple(records)
     if not records:
         raise ValueError("there is no record to validate the model on")
-    records = tuple(_as_of_model(record, about) for record in records)
+    rate = _rate(system, about)
+    records = tuple(_as_of_model(record, about, rate) for record in records)
     found = [_judged(system, about, record, estimate) for record in records]
     alarms, notes = (
         [f"{one.check.record}: {text}" for one in found for text in getattr(one, kind)]
@@ -169,17 +172,25 @@ def validate(
     )
 
 
-def _as_of_model(record: Record, about: About) -> Record:
-    """Return ``record`` in the units of the model.
+def _rate(system: System, about: About) -> float | None:
+    """Return the rate of the model (Hz), None if its parts have none or several."""
+    if about.rate_Hz is not None:
+        return about.rate_Hz
+    with suppress(ValueError):
+        return 1.0 / sample_time(system)
+    return None
+
+
+def _as_of_model(record: Record, about: About, rate: float | None) -> Record:
+    """Return ``record`` in the units of the model, which runs at ``rate`` (Hz).
 
     Raises ValueError for units that cannot be converted, and for another rate.
     """
-    rate = 1.0 / record.dt
-    if about.rate_Hz is not None and not np.isclose(rate, about.rate_Hz, rtol=1e-3):
+    if rate is not None and not np.isclose(1.0 / record.dt, rate, rtol=1e-3):
         raise ValueError(
-            f"{record.source} is sampled at {rate:.6g} Hz, and the model was made for "
-            f"{about.rate_Hz:.6g} Hz: resample the record (--resample "
-            f"{about.rate_Hz:.6g}), or fit a model at its rate"
+            f"{record.source} is sampled at {1.0 / record.dt:.6g} Hz, and the model "
+            f"was made for {rate:.6g} Hz: resample the record (--resample "
+            f"{rate:.6g}), or fit a model at its rate"
         )
     sides = [
         [

@@ -350,6 +350,15 @@ def test_records_that_cannot_be_judged(about, changes, estimate, message):
         validate(MODEL, about, record(moved(u), u, **changes), estimate=estimate)
 
 
+def test_the_rate_of_a_model_without_an_origin_is_that_of_its_parts():
+    u = excitation(2000)
+    other = Record(u, moved(u), 2.0 * DT, source="slow.csv")
+    with pytest.raises(ValueError, match=r"at 5000 Hz, and the model was made for 100"):
+        validate(MODEL, About(), other)
+    # Statics hold at any rate.
+    assert validate(pj.Affine(0.17), About(), other).report.records
+
+
 def test_a_model_of_other_channels():
     u = excitation(500)
     two = np.stack([u, u + np.arange(500.0)], axis=1)
