@@ -396,8 +396,8 @@ def _without_inverse(system: System, records: Sequence[Record]) -> list[str]:
         static[0].inverse(low, high)
     except ValueError as error:
         return [
-            f"the hysteresis has no inverse from {low:g} to {high:g} V, but inversion "
-            f"feedforward needs one: {error}"
+            f"the hysteresis has no inverse from {low:g} to {high:g} "
+            f"{records[0].input_unit}, but inversion feedforward needs one: {error}"
         ]
     return []
 

@@ -22,6 +22,9 @@ def stage(height):
 def test_an_output_that_falls_after_a_turn_is_reported():
     (warning,) = _without_inverse(stage(4.0), [RECORD])
     assert "V, but inversion feedforward needs one: between" in warning
+    scaled = Record(INPUT, 0.1 * INPUT, 1e-3, input_units="um")
+    (warning,) = _without_inverse(stage(4.0), [scaled])
+    assert "um, but inversion feedforward needs one: between" in warning
 
 
 @pytest.mark.parametrize("system", [stage(1.0), FirstOrderLag(2e-3, 1e-3)])
