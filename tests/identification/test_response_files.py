@@ -61,6 +61,27 @@ def test_matlab_and_python_control_take_a_response(tmp_path):
     np.testing.assert_allclose(found.variance, measured().variance)
 
 
+def test_a_matlab_file_keeps_all_properties(tmp_path):
+    given = measured(coherence=np.linspace(0.5, 1.0, LINES.size), resolution=2.0)
+    save_response(given, tmp_path / "r.mat")
+    found = read_response(tmp_path / "r.mat")
+    for name in ("frequency", "values", "variance", "noise", "coherence"):
+        np.testing.assert_allclose(getattr(found, name), getattr(given, name))
+    for name in ("unit", "freedom", "realisations", "amplitude", "held", "resolution"):
+        assert getattr(found, name) == getattr(given, name)
+    plain = FrequencyResponse(LINES, VALUES)
+    save_response(plain, tmp_path / "plain.mat")
+    again = read_response(tmp_path / "plain.mat")
+    assert (again.held, again.freedom, again.unit) == (None, np.inf, "um/V")
+    content = loadmat(tmp_path / "r.mat", appendmat=False)
+    content = {name: content[name] for name in content if name[0] != "_"}
+    savemat(tmp_path / "r.mat", content | {"Properties": '{"freedom": -8}'})
+    with pytest.raises(ValueError, match="freedom: Input should be greater than 0"):
+        read_response(tmp_path / "r.mat")
+    savemat(tmp_path / "r.mat", content | {"Properties": "of another program"})
+    assert read_response(tmp_path / "r.mat").held is None
+
+
 @pytest.mark.parametrize(
     ("unit", "factor"),
     [("Hz", 1.0), ("rad/s", 2 * np.pi), ("rad/TimeUnit", 2 * np.pi), ("kHz", 1e-3)],

@@ -67,6 +67,10 @@ def _npz(file: BinaryIO) -> Columns:
     return _merged(_spread(name, values, dt=step) for name, values in arrays.items())
 
 
+_MATLAB_UNITS = {"Frequency": "FrequencyUnit", "ResponseData": "ResponseUnit"}
+"""Variables of a frequency response, and those with their units."""
+
+
 def _mat(file: BinaryIO) -> Columns:
     from scipy.io import loadmat
     from scipy.io.matlab import matfile_version
@@ -76,10 +80,10 @@ def _mat(file: BinaryIO) -> Columns:
     check_elements(file.read())
     file.seek(0)
     arrays = {n: v for n, v in loadmat(file).items() if not n.startswith("__")}
-    step, unit = stated_step(arrays), _text(arrays.get("FrequencyUnit"))
+    step = stated_step(arrays)
+    units = {name: _text(arrays.get(text)) for name, text in _MATLAB_UNITS.items()}
     return _merged(
-        _spread(name, values, unit if name == "Frequency" else None, step)
-        for name, values in arrays.items()
+        _spread(name, values, units.get(name), step) for name, values in arrays.items()
     )
 
 

@@ -11,9 +11,15 @@ from ...core.files import write_bytes, write_text
 from .columns import decoded
 from .response import FrequencyResponse
 
+PROPERTIES = "Properties"
+"""Variable of a MATLAB file with the properties of a response."""
+
 
 class _Stated(BaseModel):
-    """Properties of a response in the first line of a file of piezojax."""
+    """Properties of a response in a file of piezojax, as JSON.
+
+    They are the first line of a table, or the text ``Properties`` of a MATLAB file.
+    """
 
     model_config = ConfigDict(extra="forbid")
 
@@ -23,24 +29,47 @@ class _Stated(BaseModel):
     resolution: float = Field(default=0.0, ge=0.0)
     held: float | None = Field(default=None, gt=0.0)
 
+    @classmethod
+    def of(cls, response: FrequencyResponse) -> str:
+        """Return the properties of ``response`` as JSON."""
+        known = {name: getattr(response, name) for name in cls.model_fields}
+        if not np.isfinite(response.freedom):
+            del known["freedom"]
+        return json.dumps(cls(**known).model_dump(exclude_none=True))
+
 
 def stated_in(path: Path) -> dict[str, object]:
-    """Return the properties in the first line of a text file of piezojax.
+    """Return the properties in a table or MATLAB file of piezojax.
 
     Raises ValueError, naming the property, for one that is not understood.
     """
-    if path.suffix.lower() != ".csv":
-        return {}
-    first = decoded(path.read_bytes()).partition("\n")[0]
-    if not first.startswith("# {"):
+    match path.suffix.lower():
+        case ".csv":
+            text = decoded(path.read_bytes()).partition("\n")[0].removeprefix("# ")
+        case ".mat":
+            text = _text_in(path)
+        case _:
+            text = ""
+    if not text.startswith("{"):
         return {}
     try:
-        stated = _Stated.model_validate_json(first[2:])
+        stated = _Stated.model_validate_json(text)
     except ValidationError as error:
         problem = error.errors()[0]
         key = ".".join(map(str, problem["loc"])) or "first line"
         raise ValueError(f"{path}: {key}: {problem['msg']}") from None
     return stated.model_dump(exclude_none=True)
+
+
+def _text_in(path: Path) -> str:
+    """Return the text ``Properties`` of a MATLAB file, "" if it has none."""
+    from scipy.io import loadmat
+    from scipy.io.matlab import matfile_version
+
+    if matfile_version(path)[0] == 2:  # version 7.3, which piezojax does not write
+        return ""
+    found = np.ravel(loadmat(path, variable_names=[PROPERTIES]).get(PROPERTIES, ""))
+    return str(found[0]) if found.size == 1 else ""
 
 
 def save_response(response: FrequencyResponse, path: str | Path) -> None:
@@ -50,8 +79,10 @@ def save_response(response: FrequencyResponse, path: str | Path) -> None:
     and the standard deviations of the error, of the noise and of the nonlinear
     distortion, as far as they are known; its first line holds the other properties. The
     MATLAB file has the variables ``ResponseData`` [1, 1, lines], ``Frequency`` and
-    ``FrequencyUnit``, for ``frd(ResponseData, Frequency, 'FrequencyUnit', 'Hz')``, and
-    ``deviation``. Raises ValueError for another suffix.
+    ``FrequencyUnit``, for ``frd(ResponseData, Frequency, 'FrequencyUnit', 'Hz')``, the
+    ``ResponseUnit``, the columns ``deviation``, ``noise_deviation`` and ``coherence``
+    as far as they are known, and the other ``Properties`` as JSON. Raises ValueError
+    for another suffix.
     """
     path = Path(path)
     match path.suffix.lower():
@@ -81,16 +112,8 @@ def _as_table(response: FrequencyResponse) -> str:
         columns[f"distortion_deviation [{unit}]"] = deviation
     if response.coherence is not None:
         columns["coherence"] = response.coherence
-    freedom = response.freedom if np.isfinite(response.freedom) else None
-    stated = _Stated(
-        freedom=freedom,
-        realisations=response.realisations,
-        amplitude=response.amplitude,
-        resolution=response.resolution,
-        held=response.held,
-    )
     text = io.StringIO()
-    text.write(f"# {json.dumps(stated.model_dump(exclude_none=True))}\n")
+    text.write(f"# {_Stated.of(response)}\n")
     head, table = ",".join(columns), np.column_stack([*columns.values()])
     np.savetxt(text, table, "%.10g", ",", header=head, comments="")
     return text.getvalue()
@@ -103,9 +126,15 @@ def _as_mat(response: FrequencyResponse) -> bytes:
         "ResponseData": response.values[None, None],
         "Frequency": response.frequency[:, None],
         "FrequencyUnit": "Hz",
+        "ResponseUnit": response.unit,
+        PROPERTIES: _Stated.of(response),
     }
     if response.variance is not None:
         found["deviation"] = np.sqrt(response.variance)[:, None]
+    if response.noise is not None:
+        found["noise_deviation"] = np.sqrt(response.noise)[:, None]
+    if response.coherence is not None:
+        found["coherence"] = response.coherence[:, None]
     content = io.BytesIO()
     savemat(content, found)
     return content.getvalue()
