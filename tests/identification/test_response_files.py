@@ -83,6 +83,39 @@ def test_a_matlab_file_keeps_all_properties(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("name", "factor"),
+    [
+        ("frequency_MHz", 1e-6),
+        ("frequency_mHz", 1e3),
+        ("frequency_kHz", 1e-3),
+        ("f_GHz", 1e-9),
+        ("FreqMHz", 1e-6),
+        ("f [Hz]", 1.0),
+        ("Frequency", 1.0),
+        ("omega", 2 * np.pi),
+        ("omega_krad/s", 2e-3 * np.pi),
+    ],
+)
+def test_a_frequency_may_have_a_prefix(tmp_path, name, factor):
+    write_table(tmp_path / "r.csv", name, factor * LINES)
+    found = read_response(tmp_path / "r.csv")
+    np.testing.assert_allclose(found.frequency, LINES)
+
+
+@pytest.mark.parametrize("unit", ["mhz", "THz", "dHz"])
+def test_a_frequency_of_an_unknown_unit_is_refused(tmp_path, unit):
+    write_table(tmp_path / "r.csv", f"frequency_{unit}", LINES)
+    with pytest.raises(ValueError, match=f"is in {unit}, an unknown unit of a freq"):
+        read_response(tmp_path / "r.csv")
+
+
+def write_table(path, name, frequency):
+    """Write a response with its frequencies in the column ``name``."""
+    table = np.column_stack([frequency, VALUES.real, VALUES.imag])
+    np.savetxt(path, table, "%.12g", ",", header=f"{name},real,imag", comments="")
+
+
+@pytest.mark.parametrize(
     ("unit", "factor"),
     [("Hz", 1.0), ("rad/s", 2 * np.pi), ("rad/TimeUnit", 2 * np.pi), ("kHz", 1e-3)],
 )

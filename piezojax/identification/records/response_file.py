@@ -14,8 +14,14 @@ from .saved_response import stated_in
 from .touchstone import SUFFIXES, touchstone
 from .units import unit_of
 
-_HERTZ = {"khz": 1e3, "hz": 1.0, "rad/s": 0.5 / np.pi, "omega": 0.5 / np.pi}
-"""Factors to Hz by text in the name or unit; the first that matches, else 1."""
+_FREQUENCY = re.compile(r"(?<![a-z])([a-z]?)(hz|rad/(s|sec|second|timeunit)\b)", re.I)
+"""Unit of a frequency in its name or unit: a prefix, and Hz or rad/s."""
+
+_PREFIXES = {"": 1.0, "m": 1e-3, "k": 1e3, "K": 1e3, "M": 1e6, "G": 1e9}
+"""Factors of the prefixes."""
+
+_RADIAN = 0.5 / np.pi
+"""Factor from rad/s to Hz."""
 
 _ROLES = {
     "coherence": r"coh",
@@ -53,7 +59,8 @@ def read_responses(
 ) -> list[FrequencyResponse]:
     """Read frequency responses from a table in one of ``formats.FORMATS``.
 
-    The names and units of the columns give their roles: a frequency (Hz, kHz or rad/s),
+    The names and units of the columns give their roles: a frequency (Hz or rad/s, with
+    or without a prefix as in kHz),
     and magnitude (a ratio, or dB re 1 unit of the response) with phase (degrees or
     radians), or real and imaginary part, or complex numbers, as the variables
     ``ResponseData``, ``Frequency`` and ``FrequencyUnit`` of a MATLAB file. A frequency
@@ -67,7 +74,8 @@ def read_responses(
     response, if its columns do not state it; by default UNIT.
 
     Raises ValueError, listing the columns, for a file without these columns or with
-    columns that do not belong together, for a phase whose unit is not in its name,
+    columns that do not belong together, for a frequency in another unit, for a phase
+    whose unit is not in its name,
     columns of different length, a magnitude below 0, two units, and as
     FrequencyResponse.
     """
@@ -136,18 +144,29 @@ def _frequency(columns: Columns, roles: dict[str, list[str]], path: Path) -> np.
             f"{path}: no column is a frequency; name one frequency_Hz (there are "
             f"{', '.join(columns)}), or give the --method for a record over time"
         )
-    text = _label(names[0], columns[names[0]])
-    if names[0] == "Frequency" and "ResponseData" in columns and "/" not in text:
-        text = text.replace("frequency", "", 1)
-        if not any(unit in text for unit in _HERTZ):
+    name, column = names[0], columns[names[0]]
+    return _hertz(name, column, columns, path) * _numbers(columns, name, path)
+
+
+def _hertz(name: str, column: Column, columns: Columns, path: Path) -> float:
+    """Return the unit of the frequency column ``name`` in Hz."""
+    text = f"{name} {column.unit or ''}".replace("_", " ")
+    found = _FREQUENCY.search(re.sub("(?i)frequency|freq|omega", " ", text))
+    if found is not None:
+        prefix, unit = found[1], found[2]
+        # The case tells mega from milli; in "mhz" it does not.
+        if prefix not in _PREFIXES or (prefix, unit) == ("m", "hz"):
             raise ValueError(
-                f"{path}: the unit of Frequency is not known (MATLAB's default is "
-                "rad/s): add a variable FrequencyUnit, 'Hz' or 'rad/s'"
+                f"{path}: column {name!r} is in {found[0]}, an unknown unit of a "
+                "frequency; scale it to Hz, and name it frequency_Hz"
             )
-    scale = next((s for n, s in _HERTZ.items() if n in text), 1.0)
-    if re.search(r"rad/timeunit|rad/second", text):
-        scale = _HERTZ["rad/s"]
-    return scale * _numbers(columns, names[0], path)
+        return _PREFIXES[prefix] * (1.0 if unit.lower() == "hz" else _RADIAN)
+    if name == "Frequency" and "ResponseData" in columns:
+        raise ValueError(
+            f"{path}: the unit of Frequency is not known (MATLAB's default is "
+            "rad/s): add a variable FrequencyUnit, 'Hz' or 'rad/s'"
+        )
+    return _RADIAN if "omega" in text.lower() else 1.0
 
 
 def _pairs(
