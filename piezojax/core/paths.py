@@ -52,10 +52,10 @@ def leaf_path(system: Any, keys: Iterable[Any]) -> str:
     for key in rest:
         if isinstance(node, Series | PerAxis):
             key = next(rest)
-        children = _children(node)
+        children, fields = _children(node), getattr(node, "_fields", ())
         name = keystr((key,), simple=True)
-        if isinstance(node, tuple) and name in getattr(node, "_fields", ()):
-            name = str(node._fields.index(name))
+        if name in fields:  # of a NamedTuple
+            name = str(fields.index(name))
         elif isinstance(key, SequenceKey) and children:
             name = list(children)[key.idx]
         names.append(name)
