@@ -585,6 +585,49 @@ MUTATIONS = (
         "0.6 * most * (steps - 1.0)",
         ("tests/control/test_limited_reference.py",),
     ),
+    # Alarms that did not come
+    Mutation(
+        "a device at its own limit that is not saturated",
+        "core/metrics.py",
+        "clipped = clipped | output.at_limit",
+        "clipped = clipped & True",
+        ("tests/control/test_at_limit.py",),
+    ),
+    Mutation(
+        "an unstable plant whose short runs look fine",
+        "tuning/result.py",
+        "lost |= ~np.asarray(figures.stable)",
+        "lost |= False",
+        ("tests/tuning/test_slow_modes.py",),
+    ),
+    Mutation(
+        "margins of a slow oscillation from its first 0.2 s",
+        "tuning/evaluator.py",
+        "SETTLED = 7.0",
+        "SETTLED = 0.0",
+        ("tests/tuning/test_slow_modes.py",),
+    ),
+    Mutation(
+        "gains without the alarms of the plant that a study accepts",
+        "tuning/model_alarms.py",
+        "yield from about.unsafe",
+        "yield from about.unsafe if fitted else ()",
+        ("tests/test_plants_of_studies.py", "-k", "alarms"),
+    ),
+    Mutation(
+        "margins at the end of the references that is nearer to rest",
+        "study/case.py",
+        "below = np.abs(low - rest) > np.abs(high - rest)",
+        "below = np.abs(low - rest) < np.abs(high - rest)",
+        ("tests/tuning/test_margin_reference.py",),
+    ),
+    Mutation(
+        "zeros of several sensors as motion to explain",
+        "identification/estimators/projection.py",
+        "return found - found.mean(axis=0) if len(found) else found",
+        "return found",
+        ("tests/identification/test_identify.py", "-k", "zero_of_another"),
+    ),
     # Two searches
     Mutation(
         "a second search without the end of the first",
