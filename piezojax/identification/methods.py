@@ -20,11 +20,12 @@ from .estimators.linear import by_frequency_response, by_subspace
 from .estimators.model_bouc_wen import bouc_wen
 from .estimators.model_preisach import PLAIN, RATE_DEPENDENT, preisach_with_lag
 from .estimators.neural import fit_neural_state_space
-from .estimators.output_error import Optimum, output_error, values_and_errors
+from .estimators.output_error import Optimum, output_error
 from .estimators.regression import instrumental_variables, least_squares
 from .estimators.resonances import LinearDynamics
 from .estimators.scheduled_fit import MODEL as SCHEDULED
 from .estimators.scheduled_fit import by_amplitude
+from .estimators.standard_errors import values_and_errors
 from .estimators.steady_state import fit_structure, steady_response
 from .estimators.structure import Structure
 from .records.record import Record

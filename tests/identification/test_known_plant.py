@@ -15,7 +15,8 @@ from piezojax.identification import Record, identify
 from piezojax.identification.estimators.error_problem import problem_of
 from piezojax.identification.estimators.estimate import Options
 from piezojax.identification.estimators.free_runs import free_run
-from piezojax.identification.estimators.output_error import Optimum, values_and_errors
+from piezojax.identification.estimators.output_error import Optimum
+from piezojax.identification.estimators.standard_errors import values_and_errors
 from piezojax.identification.known_plant import CHANGED, KnownPlant
 
 DT = 1e-4

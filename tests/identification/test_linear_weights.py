@@ -22,10 +22,8 @@ from piezojax.identification.estimators.linear_weights import (
     likeliest_scale,
     with_weights,
 )
-from piezojax.identification.estimators.output_error import (
-    output_error,
-    values_and_errors,
-)
+from piezojax.identification.estimators.output_error import output_error
+from piezojax.identification.estimators.standard_errors import values_and_errors
 from piezojax.identification.methods import weights_warning
 from piezojax.identification.records.record import Record
 

@@ -13,7 +13,7 @@ from piezojax.dynamics import FirstOrderLag
 from piezojax.hysteresis import PrandtlIshlinskii, Preisach, RateDependentPreisach
 from piezojax.identification import free_run
 from piezojax.identification.chain import structure
-from piezojax.identification.estimators import output_error
+from piezojax.identification.estimators import output_error, standard_errors
 from piezojax.identification.estimators.approach import TURNS, run_after
 from piezojax.identification.estimators.error_problem import at_starts, problem_of
 from piezojax.identification.estimators.free_runs import starts_of
@@ -178,13 +178,14 @@ def test_all_passes_of_a_fit_are_one_program(monkeypatch):
     record = p753_record(200, 1)
     shape = structure(MODEL, record)
     shape = shape._replace(starts=shape.starts[:2], whitening=(1.0, -0.5))
-    program, shapes = output_error._normal_equations, set()
+    program, shapes = output_error.equations_at, set()
 
     def counted(problem, free):
         shapes.add(free.shape)
         return program(problem, free)
 
-    monkeypatch.setattr(output_error, "_normal_equations", counted)
+    for module in (output_error, standard_errors):
+        monkeypatch.setattr(module, "equations_at", counted)
     found = output_error.output_error(shape, [record], slice(0, 200), steps=2)
-    output_error.values_and_errors(found)
+    standard_errors.values_and_errors(found)
     assert len(shapes) == 1

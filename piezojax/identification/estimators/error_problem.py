@@ -9,8 +9,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ...core.arrays import as_array
-from ...core.space import Space
+from ...core.space import Space, squash
 from ...core.system import System
+from ...solve.local_model import normal_equations
+from ...solve.problem import linearised
 from ..records.record import Record
 from .approach import run_after
 from .free_runs import from_rest
@@ -136,6 +138,12 @@ class Problem(eqx.Module):
         """Return the problem with other weights of the errors."""
         return eqx.tree_at(lambda problem: problem.weights, self, weights)
 
+    def with_prior(self, prior: Prior) -> "Problem":
+        """Return the problem with another prior."""
+        arrays = jax.tree.map(as_array, prior)
+        none = {"is_leaf": lambda leaf: leaf is None}
+        return eqx.tree_at(lambda problem: problem.prior, self, arrays, **none)
+
     def only(self, parts: Sequence[slice]) -> "Problem":
         """Return the problem in which a part of the samples of each record counts."""
         weights = np.zeros(self.weights.shape)
@@ -175,6 +183,18 @@ class Problem(eqx.Module):
 @eqx.filter_jit
 def _errors(problem: Problem, unit: Array) -> Array:
     return problem.errors(unit)
+
+
+@eqx.filter_jit
+def equations_at(
+    problem: Problem, free: Float[Array, "points unknowns"]
+) -> tuple[Array, Array, Array]:
+    """Return the normal equations of ``problem`` at each of ``free``.
+
+    These are points of the unit box without its bounds (``unsquash``).
+    """
+    residuals = linearised(lambda free: problem.residuals(squash(free)))
+    return normal_equations(residuals, free)
 
 
 def _bounded(error: Array) -> Array:

@@ -18,13 +18,13 @@ from ...hysteresis.preisach import STARTS
 from ..records.record import Record
 from .estimate import bound_warning
 from .free_runs import from_rest
-from .output_error import standard_errors
 from .preisach_density import (
     empty,
     fit_preisach,
     fit_rate_dependent_preisach,
     responses,
 )
+from .standard_errors import standard_errors
 
 _free_run = eqx.filter_jit(from_rest)
 

@@ -5,10 +5,9 @@ from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from ...core.arrays import as_array
 from ...core.progress import Progress, Silent
@@ -21,11 +20,15 @@ from ...solve.gauss_newton import (
     GaussNewton,
     trials_with_models,
 )
-from ...solve.local_model import normal_equations
 from ...solve.multi_start import Patience, descend
-from ...solve.problem import linearised
 from ..records.record import Record
-from .error_problem import Problem, at_stacked, at_starts, problem_of
+from .error_problem import (
+    Problem,
+    at_stacked,
+    at_starts,
+    equations_at,
+    problem_of,
+)
 from .free_runs import settled_part, settled_starts, starts_of
 from .linear_start import Start
 from .linear_weights import WeightsFit, with_weights
@@ -65,11 +68,6 @@ ends. A point with a parameter that tends to its bound does not converge by itse
 
 FAILED_LOSS = 1e11
 """Least mean square of a simulation that counts as not finite."""
-
-UNDETERMINED = 1e-14
-"""Relative eigenvalue of J'J, scaled to a unit diagonal, below which a direction is
-undetermined: rounding errors are a hundredth of it."""
-
 
 LEADING = 50_000
 """Number of samples to which a long record is fitted first."""
@@ -185,7 +183,7 @@ def output_error(
     nothing = np.zeros(starts.shape[1]), np.full(starts.shape[1], np.inf)
     none = prior = Prior(*nothing, 0.0)
     if cautious:
-        problem = _with_prior(problem, none)  # of the final size, to compile once
+        problem = problem.with_prior(none)  # of the final size, to compile once
     if noise_model:
         idle = jnp.zeros(NOISE_ORDER + 1)  # of the final size, to compile once
         problem = eqx.tree_at(lambda p: p.whitening, problem, idle)
@@ -209,7 +207,7 @@ def output_error(
     ) -> tuple[Problem, Prior]:
         """Return ``problem`` with the prior for its errors, and this prior."""
         prior = _lighter(prior, _first_guess(structure, problem, unit))
-        return _with_prior(problem, prior), prior
+        return problem.with_prior(prior), prior
 
     for turn in range(passes):
         if several and begun is not None and not turn:
@@ -262,16 +260,9 @@ def output_error(
             break
         past = left
     if cautious:
-        problem = _with_prior(problem, none)  # errors are those of the records alone
+        problem = problem.with_prior(none)  # errors are those of the records alone
         weights = weights and weights._replace(problem=problem)
     return Optimum(problem, units, losses, finished, weights)
-
-
-def _with_prior(problem: Problem, prior: Prior) -> Problem:
-    arrays = jax.tree.map(as_array, prior)
-    return eqx.tree_at(
-        lambda p: p.prior, problem, arrays, is_leaf=lambda leaf: leaf is None
-    )
 
 
 def _lighter(prior: Prior, later: Prior) -> Prior:
@@ -313,7 +304,7 @@ def _descended(
     """
     firsts = np.asarray(unsquash(as_array(starts)))
     weights = linear and with_weights(problem, linear, as_array(firsts[0]))
-    equations = partial(_normal_equations, problem)
+    equations = partial(equations_at, problem)
     evaluate = trials_with_models(
         weights.normal_equations if weights else equations, width
     )
@@ -343,72 +334,3 @@ def _descended(
 @eqx.filter_jit
 def _balanced(problem: Problem, unknown: Array) -> Problem:
     return problem.balanced(unknown)
-
-
-@eqx.filter_jit
-def _normal_equations(
-    problem: Problem, free: Float[Array, "points unknowns"]
-) -> tuple[Array, Array, Array]:
-    residuals = linearised(lambda free: problem.residuals(squash(free)))
-    return normal_equations(residuals, free)
-
-
-@eqx.filter_jit
-def _parameters(problem: Problem, free: Array) -> tuple[Array, Array]:
-    """Return the parameters at ``free``, and their derivatives."""
-
-    def values(free: Array) -> Array:
-        return problem.space.from_unit(squash(free))
-
-    return jax.jvp(values, (free,), (jnp.ones_like(free),))
-
-
-def values_and_errors(optimum: Optimum) -> tuple[np.ndarray, list[float | None]]:
-    """Return the parameters of the best point and their standard errors.
-
-    The errors are those of Gauss-Newton: the covariance is s^2 (J'J)^-1, for white
-    residuals. A prior that is not switched off adds its own information, that of its
-    deviations. A parameter in a direction that neither the record nor a prior
-    determines has the error None.
-    """
-    problem, free = optimum.problem, unsquash(as_array(optimum.units))
-    prior, loss = problem.prior, optimum.losses[0]
-    if prior is not None and not float(prior.scale):
-        prior = None
-    if prior is not None:
-        # Its rows have the scale of the errors of the model, not of white noise.
-        off = prior.weights * (optimum.units[0] - prior.known)
-        loss -= float(np.sum(np.asarray(off) ** 2))
-        problem = _with_prior(problem, prior._replace(scale=0.0))
-    best = as_array(np.asarray(free)[0])
-    values, slopes = map(np.asarray, _parameters(problem, best))
-    if optimum.weights:
-        curvature = optimum.weights.normal_equations(best[None])[2][0]
-    else:
-        # All points, because the program of the descents is compiled for their number.
-        curvature = np.asarray(_normal_equations(problem, free)[2])[0]
-    slopes = np.where(slopes == 0.0, 1.0, slopes)
-    kinds = 2 if problem.whitening.size and float(problem.plain) else 1
-    counted = kinds * int(np.sum(np.asarray(problem.weights) > 0))
-    variance = loss / max(counted - values.size, 1)
-    if prior is not None:
-        _, tilt = jax.jvp(squash, (best,), (jnp.ones_like(best),))
-        own = np.asarray(tilt / prior.deviations) ** 2
-        curvature = curvature + variance * np.diag(own)
-    return values, standard_errors(curvature / np.outer(slopes, slopes), variance)
-
-
-def standard_errors(curvature: np.ndarray, variance: float) -> list[float | None]:
-    """Return the square roots of the diagonal of ``variance`` (J'J)^-1.
-
-    ``curvature`` is J'J. None for a parameter in a direction that it does not
-    determine.
-    """
-    scale = np.sqrt(np.diag(curvature))
-    scale = np.where(scale > 0.0, scale, 1.0)
-    strength, directions = np.linalg.eigh(curvature / np.outer(scale, scale))
-    weak = strength < UNDETERMINED * strength[-1]
-    known = np.sum(directions[:, weak] ** 2, axis=1) < 1e-6
-    inverse = np.where(weak, 0.0, 1.0 / np.where(weak, 1.0, strength))
-    spread = np.sqrt(variance * (directions**2 @ inverse)) / scale
-    return [float(d) if k else None for d, k in zip(spread, known, strict=True)]
