@@ -9,7 +9,6 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from .arrays import Signal, State, as_array, as_signal
-from .limited import at_limit
 from .parameter import PartUnits
 from .root import root
 from .system import System, at_rest, resolve, rest_output
@@ -47,8 +46,6 @@ class LoopSample(NamedTuple):
     """Output of a loop at sample k, in um and V.
 
     ``command`` is the output of the controller, ``voltage`` that of the actuator.
-    ``at_limit`` tells whether a limit of the controller's own holds the command, None
-    if it has none (``Limited``).
     """
 
     reference: Signal
@@ -56,7 +53,6 @@ class LoopSample(NamedTuple):
     measured: Signal
     command: Signal
     voltage: Signal
-    at_limit: Any = None
 
 
 class LoopState(NamedTuple):
@@ -132,12 +128,7 @@ class Feedback(System):
         if input.disturbance is not None:
             displacement = jax.tree.map(jnp.add, displacement, input.disturbance)
         sample = LoopSample(
-            state.reference,
-            state.displacement,
-            measured,
-            command,
-            voltage,
-            at_limit(self.controller, command),
+            state.reference, state.displacement, measured, command, voltage
         )
         state = LoopState(
             controller,

@@ -1,13 +1,14 @@
-"""Systems that limit their own output."""
+"""Systems that limit their own output, and loops that are watched for it."""
 
 import abc
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from .arrays import Scalar
+from .arrays import Scalar, Signal, State
 from .axes import PerAxis
+from .feedback import Feedback, LoopSample
 from .system import System
 
 NEAR = 1e-9
@@ -43,3 +44,38 @@ def at_limit(system: System, output: Any) -> Any:
         inside = NEAR * (upper - lower)
         found |= (output <= lower + inside) | (output >= upper - inside)
     return found
+
+
+class WatchedSample(NamedTuple):
+    """LoopSample of a watched loop, in um and V.
+
+    ``at_limit`` tells whether a limit of the controller's own holds the command; None
+    if it has none.
+    """
+
+    reference: Signal
+    displacement: Signal
+    measured: Signal
+    command: Signal
+    voltage: Signal
+    at_limit: Any
+
+
+Sample = LoopSample | WatchedSample
+
+
+class Watched(System):
+    """A resolved ``loop`` whose samples tell whether its controller is at a limit.
+
+    State and input are those of the loop, the output is a WatchedSample.
+    """
+
+    loop: Feedback
+
+    def init(self, input: Any = 0.0) -> State:
+        return self.loop.init(input)
+
+    def step(self, state: State, input: Any) -> tuple[State, WatchedSample]:
+        state, sample = self.loop.step(state, input)
+        held = at_limit(self.loop.controller, sample.command)
+        return state, WatchedSample(*sample, held)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .arrays import Scalar, State
-from .feedback import LoopSample
+from .limited import Sample
 from .rollout import Metric
 
 
@@ -36,7 +36,7 @@ class Tracking(Metric):
     ``start`` is the first sample of the window: the thesis excludes the start-up
     transient. A sample counts as saturated if the voltage differs from the command by
     more than ``tolerance`` (V), so that the rounding of a converter does not count, and
-    if the command is at a limit of the controller's own (``LoopSample``). If a run ends
+    if the command is at a limit of the controller's own (``Watched``). If a run ends
     before ``start``, the figures over the window are NaN.
     """
 
@@ -57,14 +57,15 @@ class Tracking(Metric):
             "last": zero,
         }
 
-    def update(self, total: State, index: Array, output: LoopSample) -> State:
+    def update(self, total: State, index: Array, output: Sample) -> State:
         inside = jnp.where(index >= self.start, 1.0, 0.0)
         error = output.displacement - output.reference
         voltage = output.voltage
         change = jnp.where(index > self.start, voltage - total["last"], 0.0)
         clipped = jnp.abs(output.command - voltage) > self.tolerance
-        if output.at_limit is not None:
-            clipped = clipped | output.at_limit
+        held = getattr(output, "at_limit", None)
+        if held is not None:
+            clipped = clipped | held
         return {
             "samples": total["samples"] + 1.0,
             "count": total["count"] + inside,
@@ -124,7 +125,7 @@ class Extremes(Metric):
             "bottom": -least,
         }
 
-    def update(self, total: State, index: Array, output: LoopSample) -> State:
+    def update(self, total: State, index: Array, output: Sample) -> State:
         first = index <= self.start
         change = output.voltage - jnp.where(first, output.voltage, total["last"])
         return {
@@ -155,7 +156,7 @@ class Chosen(Metric):
     def init(self) -> State:
         return self.metric.init()
 
-    def update(self, total: State, index: Array, output: LoopSample) -> State:
+    def update(self, total: State, index: Array, output: Sample) -> State:
         return self.metric.update(total, index, output)
 
     def result(self, total: State) -> dict[str, Any]:
@@ -172,7 +173,7 @@ class MetricPair(Metric):
     def init(self) -> State:
         return self.first.init(), self.second.init()
 
-    def update(self, total: State, index: Array, output: LoopSample) -> State:
+    def update(self, total: State, index: Array, output: Sample) -> State:
         return (
             self.first.update(total[0], index, output),
             self.second.update(total[1], index, output),

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..core.arrays import Scalar, State
-from ..core.feedback import LoopSample
+from ..core.limited import Sample
 from ..core.metrics import root
 from ..core.rollout import Metric
 
@@ -56,7 +56,7 @@ class ContourError(Metric):
             "displacement": origin,
         }
 
-    def update(self, total: State, index: Array, output: LoopSample) -> State:
+    def update(self, total: State, index: Array, output: Sample) -> State:
         first, second = self.axes
         reference = output.reference[first], output.reference[second]
         error = _less(total["displacement"], total["last"])

@@ -15,6 +15,7 @@ from ..analysis.stability.sampled_margins import peak_of
 from ..analysis.stability.small_motion import sensitivities
 from ..core.axes import PerAxisMetric, packed
 from ..core.feedback import Feedback, loop_inputs
+from ..core.limited import Watched
 from ..core.metrics import Chosen, Tracking
 from ..core.paths import replace
 from ..core.rollout import Metric, in_blocks, simulate
@@ -96,7 +97,7 @@ class Simulator:
         metric, every = self._metric(), self.every
 
         def loop_at(values):
-            return replace(loop, dict(zip(paths, values, strict=True)))
+            return Watched(replace(loop, dict(zip(paths, values, strict=True))))
 
         def run(drives):
             reference, run_noise = drives
@@ -124,7 +125,9 @@ class Simulator:
 
         results = jax.lax.map(run, (reference, run_noise))
         if SENSITIVITY in self.metrics:
-            results[SENSITIVITY] = in_blocks(lambda v: self._peaks(loop_at(v)), values)
+            results[SENSITIVITY] = in_blocks(
+                lambda v: self._peaks(loop_at(v).loop), values
+            )
         names = (*self.metrics, *(TRAJECTORIES if self.every else ()))
         return {name: results[name] for name in names}
 

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..core.axes import PerAxisMetric
-from ..core.feedback import Feedback, LoopSample, loop_inputs
+from ..core.feedback import Feedback, loop_inputs
+from ..core.limited import Sample, Watched
 from ..core.metrics import MetricPair, Tracking
 from ..core.rollout import Metric
 from ..core.system import resolve
@@ -72,7 +73,7 @@ class Signals(eqx.Module):
         return dataclasses.replace(self, holding=stage.holding)
 
 
-def _error(sample: LoopSample) -> Any:
+def _error(sample: Sample) -> Any:
     return jax.tree.map(jnp.subtract, sample.displacement, sample.reference)
 
 
@@ -116,7 +117,8 @@ def sampled(
         inputs = loop_inputs(reference, *run_noise)
         state = loop.init(reference[0], holding)
         logged = _error if every > 1 else None
-        figures, log = metered(loop, inputs, state, metric, log=logged, every=every)
+        watched = Watched(loop)
+        figures, log = metered(watched, inputs, state, metric, log=logged, every=every)
         if log is None:
             return figures, None
         counted = jax.tree.map(lambda x: x[start // every :], log)

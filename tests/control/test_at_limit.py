@@ -8,7 +8,7 @@ import piezojax as pj
 from piezojax.control import E727, NV200, PyRPL, Servo, Stabilizer
 from piezojax.core.axes import PerAxis
 from piezojax.core.feedback import Feedback, loop_inputs
-from piezojax.core.limited import at_limit
+from piezojax.core.limited import Watched, at_limit
 from piezojax.core.metrics import Tracking
 from piezojax.core.rollout import simulate
 from piezojax.core.system import Affine, resolve
@@ -50,7 +50,8 @@ def test_samples_at_the_limits_of_a_device_are_saturated(name, engine):
     held = np.isclose(voltage, voltage.max(), rtol=1e-9)
     held |= np.isclose(voltage, voltage.min(), rtol=1e-9)
     assert 0.2 < held.mean() < 0.95
-    figures, _ = metered(loop, inputs, state, Tracking(0), engine=engine)
+    watched = Watched(loop)
+    figures, _ = metered(watched, inputs, state, Tracking(0), engine=engine)
     assert float(figures.saturated) == pytest.approx(held.mean(), abs=1e-12)
 
 

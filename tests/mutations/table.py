@@ -589,7 +589,7 @@ MUTATIONS = (
     Mutation(
         "a device at its own limit that is not saturated",
         "core/metrics.py",
-        "clipped = clipped | output.at_limit",
+        "clipped = clipped | held",
         "clipped = clipped & True",
         ("tests/control/test_at_limit.py",),
     ),
