@@ -317,6 +317,13 @@ def test_a_filter_that_is_off_is_searched_below_half_the_rate(study, refusal, na
     )
 
 
+def test_a_pattern_takes_filters_that_are_off(study):
+    device = {name: x for name, x in SWITCHED["filter_1"].items() if name != "filter_1"}
+    case = read(study({"controller": device, "parameters": GONE, "tune": ["*"]}))
+    assert case.space.ranges()["controller.filter_1"].upper == pytest.approx(9900.0)
+    assert any("filter_1 is above half the sampling rate" in x for x in case.notes)
+
+
 def test_a_factor_stays_within_the_limits_of_the_device(study):
     device = {"type": "E727", "proportional": 0.1, "integral_time": 1e-3, "scale": 2.0}
     device |= {"lower": 0.0, "upper": 100.0, "notch_frequency_1": 7e3}

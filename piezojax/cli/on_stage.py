@@ -68,8 +68,8 @@ def learning_law(results: Path, named: Path | None) -> "LearningFilter":
 
     case, loop = load_loop(results, named)
     bound = case.plant_about.error_bound
-    highest = float(np.max(case.margin_reference))
-    return learning_filter(loop, highest, case.study.dt, bound)
+    reference = float(np.max(case.margin_reference))
+    return learning_filter(loop, reference, case.study.dt, bound)
 
 
 @contextmanager

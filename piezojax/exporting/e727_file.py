@@ -47,7 +47,7 @@ def _notes(device: E727, saved: Mapping[str, str]) -> list[str]:
         f"Scale: {float(device.scale):.6g} V/um for P = 1, as entered in the study.",
         "Structure of the PID: ASSUMED, P multiplies all terms; measure it first."
         if device.structure == UNKNOWN
-        else f"Structure of the PID: {device.structure}, as entered in the study.",
+        else f"Structure of the PID: {device.structure}, as in the study.",
         "Options that the manual does not specify, as simulated: "
         f"anti-windup {device.anti_windup}, "
         "the transfer function of a notch with a bandwidth other than 1.",

@@ -39,6 +39,10 @@ from .residuals.report import ResidualReport, residual_report
 POOR = 0.2
 """Validation error, as a share of the output's deviation, above which to warn."""
 
+NOISE = 1.5
+"""Ratio to white noise of the same differences above which an output of several has
+motion that a model should explain."""
+
 MISSED = 0.1
 """Least relative distance of the nearest pole from a resonance that a model lacks."""
 
@@ -439,12 +443,19 @@ def _error_warnings(
     )
     outputs = np.concatenate([motion(r, r.outputs, part) for r in records])
     shares = unexplained_shares(errors, outputs)
+    moves = _moves(outputs) if shares.size > 1 else [True]
     return [
         f"the model explains little{of_output(i, shares.size)}: its validation error "
         f"is {100.0 * share:.0f} % of the output's own deviation"
-        for i, share in enumerate(shares)
-        if share > POOR
+        for i, (share, moved) in enumerate(zip(shares, moves, strict=True))
+        if share > POOR and moved
     ]
+
+
+def _moves(outputs: np.ndarray) -> np.ndarray:
+    """Return whether each of ``outputs`` [samples, p] does more than white noise."""
+    noise = np.std(np.diff(outputs, axis=0), axis=0) / np.sqrt(2.0)
+    return np.std(outputs, axis=0) > NOISE * noise
 
 
 def unexplained_shares(errors: np.ndarray, outputs: np.ndarray) -> np.ndarray:

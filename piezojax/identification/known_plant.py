@@ -77,7 +77,8 @@ class KnownPlant:
     def model(self) -> str:
         """Names of its parts, as in ``identify``."""
         names: dict[type, str] = {kind: name for name, kind in known_parts().items()}
-        parts = self.system.parts if isinstance(self.system, Series) else (self.system,)
+        assert isinstance(self.system, Series)
+        parts = self.system.parts
         return "+".join(names[type(part)] for part in parts if type(part) in names)
 
     def structure(self, records: Sequence[Record]) -> Structure:
@@ -164,8 +165,7 @@ def _is_linear(path: str) -> bool:
 
 def _with_delay(system: System, dt: float) -> System:
     """Return ``system`` with a delay that may be longer than the known one."""
-    if not isinstance(system, Series):
-        return system
+    assert isinstance(system, Series)
     names, parts = list(system.names), list(system.parts)
     if DELAY not in names:
         place = len(parts) - isinstance(parts[-1], Affine)

@@ -206,7 +206,7 @@ def stability_table(stability: StabilityReports) -> Table:
             "-",
         )
     for name in stability.problems:
-        table.add_row("tuned" if name == "after" else name, "-", "-", "-", "-")
+        table.add_row(name.replace("after", "tuned", 1), "-", "-", "-", "-")
     return table
 
 

@@ -17,7 +17,7 @@ from ..catalog import PLANTS, deviations_of
 from ..core.arrays import as_array
 from ..core.feedback import Feedback
 from ..core.files import read_model
-from ..core.paths import declared, get, replace
+from ..core.paths import declared, get, parameters, replace
 from ..core.system import System
 from .ensemble_table import EnsembleTable
 from .make_hardware import driven
@@ -243,8 +243,10 @@ def _standard_errors(path: Path, nominal: Stage) -> tuple[dict[str, float], list
     for name, error in errors.items():
         _check_path(nominal, name, "ensemble.standard_errors")
         _check_inside(nominal, name, error)
+    # A fit also names the states before its records, which no plant has.
+    own = {f"plant.{name}" for name in parameters(nominal.plant)}
     held = [f"plant.{name}" for name in estimates]
-    return errors, [name for name in held if name not in errors]
+    return errors, [name for name in held if name in own and name not in errors]
 
 
 def _check_inside(stage: Stage, path: str, error: float) -> None:

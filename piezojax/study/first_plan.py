@@ -167,6 +167,11 @@ class Plan:
         one_of(self.controller, ALL_DESIGNS)
         if self.structure is not None:
             check_option("structure", self.structure, STRUCTURES)
+            if self.controller != "e727":
+                raise ValueError(
+                    "structure is that of the PID of an e727, and the controller is "
+                    f"{self.controller}: leave it out"
+                )
         for field in fields(self):
             value = getattr(self, field.name)
             if field.type is float and not np.isfinite(value):

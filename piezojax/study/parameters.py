@@ -68,7 +68,23 @@ def _ranges(study: Study, loop: Feedback) -> tuple[dict[str, Range], tuple[str, 
         path: dataclasses.replace(ranges[path], start=ranges[path].lower)
         for path in switched_off
     }
+    # The frequency of a filter that is off may be any.
+    beyond = [
+        path
+        for path in tables.keys() - {*study.parameters, *study.tune}
+        if (known := declared(loop, path)) is not None
+        and known.switched
+        and float(get(loop, path)) > ranges[path].upper
+    ]
+    ranges |= {
+        path: dataclasses.replace(ranges[path], start=ranges[path].upper)
+        for path in beyond
+    }
     notes = tuple(
+        f"{path} is above half the sampling rate; the search starts from its upper "
+        f"bound, {ranges[path].upper:g}"
+        for path in sorted(beyond)
+    ) + tuple(
         f"{path} is 0 in the controller, outside its {ranges[path].scale} scale; "
         f"the search starts from its lower bound, {ranges[path].lower:g}"
         for path in sorted(switched_off)

@@ -172,7 +172,8 @@ def exact_figures(
     """
     found: dict[str, dict[str, float | None] | None] = {}
     for branch, report in stability.reports.get("after", {}).items():
-        found[f" on the {branch} branch"] = _figures(report, [report])
+        side, *place = branch.split(" ", 1)
+        found[" ".join([f" on the {side} branch", *place])] = _figures(report, [report])
     if "after" in stability.axes:
         found[""] = _worst([_axes_figures(r) for r in stability.axes["after"].reports])
     return found
@@ -311,7 +312,7 @@ def _step_alarms(steps: Mapping[str, StepResult]) -> Iterable[str]:
 def _plant_alarms(perturbed: Perturbed | None) -> Iterable[str]:
     if perturbed is not None and perturbed.unstable:
         yield (
-            "the tuned loop diverges or stays at a voltage limit on "
+            "the tuned loop is unstable, diverges or stays at a voltage limit on "
             f"{perturbed.unstable} of {perturbed.plants} perturbed plants: raise "
             "ensemble.tune, or tighten constraints.sensitivity_peak"
         )

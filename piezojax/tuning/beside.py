@@ -86,7 +86,8 @@ def _of_plants(errors: np.ndarray) -> dict[str, Any]:
 def _errors(figures: LoopFigures, driven: np.ndarray) -> np.ndarray:
     """Return, by plant, the geometric mean over references of the RMS error, um.
 
-    It is infinite where a run diverges or stays at a voltage limit.
+    It is infinite where the loop is unstable or a run diverges or stays at a voltage
+    limit.
     """
     logarithms, lost = log_errors(figures)
     means = np.exp(np.mean(logarithms[:, driven], axis=1))

@@ -81,11 +81,11 @@ def judging(data: Data, case: Case, loop: Feedback) -> Data:
     Only the hold-out changes. ``data`` is returned as it is without a residual, and on
     several axes.
     """
-    study, highest = case.study, case.margin_reference
-    if not depends_on_loop(case) or isinstance(highest, tuple):
+    study, reference = case.study, case.margin_reference
+    if not depends_on_loop(case) or isinstance(reference, tuple):
         return data
     samples = case.references.shape[1]
-    worst_for = suppression_of(loop, highest, samples, study.settled, study.dt)
+    worst_for = suppression_of(loop, reference, samples, study.settled, study.dt)
     return dataclasses.replace(
         data, holdout=_signals(case, "validate", data.holdout.holding, worst_for)
     )

@@ -198,8 +198,10 @@ class Evaluator:
         """Return the margins on each of ``stages``, or None if no limit needs them."""
         if not uses(self.limits, "margins"):
             return None
-        bound, dt = self._case.plant_about.error_bound, self._case.study.dt
-        error = bound and as_array(bound.supported(lines(dt, duration)))
+        bound, error = self._case.plant_about.error_bound, self.model_error
+        if bound is not None and duration is not None:
+            frequency = lines(self._case.study.dt, duration)
+            error = as_array(bound.supported(frequency))
         stages = own_stage(loop) if stages is None else stages
         limits = tuple(self.limits)
         return self._on_margin_stages(
@@ -270,7 +272,8 @@ def _duration(lasts: float, dt: float) -> float | None:
     default = default_duration(dt)
     if lasts <= default:
         return None
-    return float(min(default * 2.0 ** np.ceil(np.log2(lasts / default)), MOST * dt))
+    longer = default * 2.0 ** np.ceil(np.log2(lasts / default))
+    return float(max(default, min(longer, MOST * dt)))
 
 
 @eqx.filter_jit

@@ -79,7 +79,7 @@ INTERRUPTED = StabilityReports(problems={"after": "their computation was interru
 def exact_stability(case: Case, search: SearchState) -> StabilityReports:
     """Return the exact stability of the loops "before" and "after".
 
-    The operating points are both ends of the range of the references.
+    On one axis the operating points are both ends of the range of the references.
     """
     study = case.study
     after = case.space.put(case.loop, as_array(search.unit))

@@ -49,7 +49,7 @@ def make_objective(
         model_error=evaluator.model_error,
         over=table.ensemble.aggregate if table.ensemble else "mean",
         tail=table.ensemble.tail if table.ensemble else 1.0,
-        highest=as_array(case.margin_reference),
+        margin_reference=as_array(case.margin_reference),
         step_test=evaluator.step_test,
         dt=table.dt,
     )

@@ -130,7 +130,7 @@ class Objective(eqx.Module):
 
     ``limits`` are the limits of constraints by name (``constraints.CONSTRAINTS``). They
     must hold on every stage; limits on margins must hold on every one of
-    ``margin_stages``, at the reference ``highest`` (um). The limits on Ms and the delay
+    ``margin_stages``, at ``margin_reference`` (um). The limits on Ms and the delay
     margin must also hold for all plants within the relative error ``model_error``
     [lines] of these stages. ``step_test`` evaluates the limits on steps, None on
     several axes. ``loss`` is an augmented Lagrangian with ``multipliers`` and
@@ -154,7 +154,7 @@ class Objective(eqx.Module):
     effort_weight: float = eqx.field(static=True, default=0.0)
     slew_weight: float = eqx.field(static=True, default=0.0)
     limits: dict[str, Array] = eqx.field(default_factory=dict)
-    highest: Array | None = None
+    margin_reference: Array | None = None
     step_test: StepTest | None = None
     dt: float = eqx.field(static=True, default=1.0)
     multipliers: Float[Array, " constraints"] = eqx.field(
@@ -225,7 +225,7 @@ class Objective(eqx.Module):
                 self.limits,
                 lambda stage: loop_of(unit, stage),
                 self.margin_stages,
-                OperatingPoint(self.highest, dt=self.dt),
+                OperatingPoint(self.margin_reference, dt=self.dt),
                 self.model_error,
             )
         steps = None

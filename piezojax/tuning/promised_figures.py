@@ -63,8 +63,8 @@ def promised_figures(
         found.append(PromisedFigure(name, 1e3 * rms, "nm", relative.T @ relative))
     limits = tuple(n for n in study.limits if CONSTRAINTS[n].source == "margins")
     if limits:
-        highest = as_array(case.margin_reference)
-        values, slope_of = _margins(unknowns, loop, limits, highest, study.dt, start)
+        reference = as_array(case.margin_reference)
+        values, slope_of = _margins(unknowns, loop, limits, reference, study.dt, start)
         for name in limits:
             slope = np.asarray(slope_of[name])
             value = float(np.exp(values[name]))
@@ -104,7 +104,7 @@ def _margins(
     unknowns: Unknowns,
     loop: Feedback,
     limits: tuple[str, ...],
-    highest: Array,
+    reference: Array,
     dt: float,
     changes: Array,
 ) -> tuple[dict[str, Array], dict[str, Array]]:
@@ -112,7 +112,7 @@ def _margins(
 
     def logarithms(changes: Array) -> tuple[dict[str, Array], dict[str, Array]]:
         changed = dataclasses.replace(loop, plant=unknowns.at(changes))
-        point = OperatingPoint(highest, dt=dt)
+        point = OperatingPoint(reference, dt=dt)
         margins = margins_on(limits, lambda _: changed, None, point, None)
         found = {
             name: jnp.log(CONSTRAINTS[name].worst(margins[name])) for name in limits

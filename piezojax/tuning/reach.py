@@ -3,6 +3,8 @@
 import numpy as np
 
 from ..analysis.stroke import stroke_of
+from ..core.limited import Limited
+from ..core.system import resolve
 from ..study import Case
 from .data import Data
 
@@ -14,12 +16,20 @@ limit varies slightly with noise, drift and history."""
 def require_reach(case: Case, data: Data) -> None:
     """Raise ValueError if a reference leaves the stroke of the stage by over ``SLACK``.
 
-    The message names the reference, its range, the stroke and the remedy.
+    The stroke is that between the limits of the actuator, or those of a device that
+    limits its own voltage further. The message names the reference, its range, the
+    stroke and the remedy.
     """
-    study = case.study
-    table, limits = study.references, study.actuator
+    study, table = case.study, case.study.references
+    lower, upper = map(study.by_axis, (study.actuator.lower, study.actuator.upper))
+    controller, limiting = resolve(case.loop.controller), "actuator"
+    if isinstance(controller, Limited):
+        ends = [float(end) for end in controller.ends]
+        if ends[0] > lower[0] or ends[1] < upper[0]:
+            limiting = "controller"
+        lower, upper = (max(lower[0], ends[0]),), (min(upper[0], ends[1]),)
     stage = case.loop.actuator >> case.loop.plant
-    found = stroke_of(stage, study.by_axis(limits.lower), study.by_axis(limits.upper))
+    found = stroke_of(stage, lower, upper)
     names = study.axes.names if study.axes else ("",)
     units = study.axes.units if study.axes else ("um",)
     references = np.asarray(data.holdout.references)
@@ -55,5 +65,5 @@ def require_reach(case: Case, data: Data) -> None:
             f"references.{part}: {signal} spans "
             f"{bottoms[run]:.4g} to {tops[run]:.4g} {unit}, beyond the stroke of "
             f"{where}, {lowest:.4g} to {highest:.4g} {unit} between the limits of the "
-            f"actuator: {remedy}"
+            f"{limiting}: {remedy}"
         )

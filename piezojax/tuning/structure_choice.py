@@ -171,7 +171,7 @@ def explain(structures: Sequence[Structure], chosen: int) -> None:
 
 def _reason(one: Structure, best: Structure) -> str:
     if one.error_um is None:
-        return "a run diverges or stays at a voltage limit"
+        return "the loop is unstable, or a run diverges or stays at a voltage limit"
     if one.alarms > best.alarms:
         return f"{one.alarms} alarms; the chosen structure has {best.alarms}"
     if one.idle:

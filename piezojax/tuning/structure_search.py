@@ -150,9 +150,9 @@ def _shown_modes(case: Case) -> tuple[list[PlantMode], list[str]]:
     a fit to noise. It is left out.
     """
     study = case.study
-    highest = case.margin_reference
-    assert isinstance(highest, float)  # structures are for one axis
-    modes = plant_modes(case.loop.plant, highest, study.dt)
+    reference = case.margin_reference
+    assert isinstance(reference, float)  # structures are for one axis
+    modes = plant_modes(case.loop.plant, reference, study.dt)
     bound = case.plant_about.error_bound
     if bound is None:
         return modes, []

@@ -121,7 +121,7 @@ def test_what_an_e727_file_leaves_out(tmp_path):
     assert "Structure of the PID: ASSUMED, P multiplies all terms" in text
     stated = dataclasses.replace(slow, structure="parallel")
     text = exported(stated, tmp_path / "c")[".txt"].read_text()
-    assert "Structure of the PID: parallel, as entered in the study." in text
+    assert "Structure of the PID: parallel, as in the study." in text
 
 
 @pytest.mark.parametrize(

@@ -327,3 +327,17 @@ def test_the_zero_of_another_sensor_is_no_motion_to_explain(clean, zero):
     report = identify(records, "lag", train=TRAIN, validate=slice(900, 1200)).report
     assert any("the model explains little" in alarm for alarm in report.alarms)
     assert any("2.9" in each and "times as far" in each for each in report.warnings)
+
+
+def test_an_output_that_only_shows_noise_has_no_alarm():
+    random = np.random.default_rng(3)
+    drive = random.standard_normal(SAMPLES)
+    moved = np.convolve(drive, 0.5 ** np.arange(1, 20))[: SAMPLES - 1]
+    quiet = 1e-3 * random.standard_normal(SAMPLES)
+    bent = np.convolve(drive**2, 0.8 ** np.arange(20))[:SAMPLES]
+    for second, expected in ((quiet, False), (bent, True)):
+        outputs = np.column_stack([np.r_[0.0, moved], second])
+        both = Record(drive[:, None], outputs, DT)
+        report = identify(both, "state_space", options=Options(order=2)).report
+        found = ["explains little of output 1" in alarm for alarm in report.alarms]
+        assert found == [True] * expected

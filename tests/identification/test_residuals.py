@@ -354,6 +354,17 @@ def test_the_interval_holds_at_its_level_for_any_number_of_periods(periods, gain
         assert np.mean(inside) > 0.99
 
 
+@pytest.mark.parametrize("samples", [1200, 4000])
+def test_the_interval_holds_at_its_level_without_periods(samples):
+    inside, random = [], np.random.default_rng([78, samples])
+    for _ in range(150):
+        input = random.standard_normal(samples)
+        record = Record(input, input + 0.02 * random.standard_normal(samples), DT)
+        found = relative_error(record, input, slice(0, samples))
+        inside += [*(found.error <= found.margin)]
+    assert np.mean(inside) == pytest.approx(0.99, abs=0.004)
+
+
 @pytest.mark.parametrize("chance", [0.05, 0.01, 1e-5])
 def test_the_half_width_is_a_quantile_of_the_f_distribution(chance):
     for averages in (2.0, 2.84, 3.0, 8.0, 15.0, 100.0):

@@ -94,6 +94,7 @@ def test_a_matlab_file_keeps_all_properties(tmp_path):
         ("Frequency", 1.0),
         ("omega", 2 * np.pi),
         ("omega_krad/s", 2e-3 * np.pi),
+        ("frequency_rad_s", 2 * np.pi),
     ],
 )
 def test_a_frequency_may_have_a_prefix(tmp_path, name, factor):
@@ -105,6 +106,13 @@ def test_a_frequency_may_have_a_prefix(tmp_path, name, factor):
 @pytest.mark.parametrize("unit", ["mhz", "THz", "dHz"])
 def test_a_frequency_of_an_unknown_unit_is_refused(tmp_path, unit):
     write_table(tmp_path / "r.csv", f"frequency_{unit}", LINES)
+    with pytest.raises(ValueError, match=f"is in {unit}, an unknown unit of a freq"):
+        read_response(tmp_path / "r.csv")
+
+
+@pytest.mark.parametrize("unit", ["rpm", "1/s"])
+def test_a_stated_unit_that_is_no_frequency_is_refused(tmp_path, unit):
+    write_table(tmp_path / "r.csv", f"frequency [{unit}]", LINES)
     with pytest.raises(ValueError, match=f"is in {unit}, an unknown unit of a freq"):
         read_response(tmp_path / "r.csv")
 

@@ -1,7 +1,10 @@
 """The operating points at which the margins of a study are judged."""
 
+import dataclasses
+
 import pytest
 
+import piezojax as pj
 from piezojax.analysis.stability import OperatingPoint, stability_report
 from piezojax.analysis.stability.operating_point import BRANCHES
 from piezojax.solve.search_state import SearchState
@@ -36,3 +39,20 @@ def test_margins_are_judged_far_from_rest_and_at_the_other_end(offset, far):
     ]
     assert worst == pytest.approx(max(peaks[:2]), rel=1e-6)
     assert worst > 1.2 * max(peaks[2:])
+
+
+def test_an_end_at_which_the_stage_cannot_rest_is_named():
+    """The actuator ends at 0 V, where the stage rests a little above the reference."""
+    case = case_of(6.0, 0.0)
+    data = case.study.model_dump(exclude_unset=True)
+    data["actuator"]["lower"] = 0.0
+    plant = pj.series(stage=case.loop.plant, offset=pj.core.system.Affine(1.0, 0.01))
+    loop = dataclasses.replace(
+        case.loop, plant=plant, actuator=pj.hardware.Saturation(0.0, 120.0)
+    )
+    shifted = dataclasses.replace(case, loop=loop)
+    search = SearchState(case.space.nearest(case.loop))
+    found = exact_stability(shifted, search)
+    assert set(found.reports["after"]) == set(BRANCHES)
+    assert "cannot rest" in found.problems["after at 0 um"]
+    assert "after" not in found.problems

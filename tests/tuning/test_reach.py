@@ -7,6 +7,7 @@ from unittest.mock import Mock
 import pytest
 
 import piezojax as pj
+from piezojax.core.paths import replace
 from piezojax.identification.response_model import ResponseModel
 from piezojax.study import Study, build, read, shipped
 from piezojax.tuning.data import make_data
@@ -90,6 +91,13 @@ def test_the_stroke_of_a_fitted_model_points_to_its_record():
 def test_every_reference_is_checked(references, message):
     with pytest.raises(ValueError, match=message):
         checked(references)
+
+
+def test_the_limits_of_a_device_count():
+    case = read(shipped("nv200"))
+    low = replace(case.loop, {"controller.avmax": 30.0})
+    with pytest.raises(ValueError, match="between the limits of the controller: red"):
+        require_reach(dataclasses.replace(case, loop=low), make_data(case))
 
 
 @pytest.mark.parametrize("way", [1.0, -1.0])

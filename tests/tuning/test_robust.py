@@ -396,6 +396,7 @@ def test_draws_follow_the_standard_errors_of_a_fit(tmp_path):
     fit = {"parameters": {
         "dynamics.moving.0": {"value": 1.0, "standard_error": 1e-3},
         "hysteresis.a": {"value": 1.0, "standard_error": None},
+        "input before the record": {"value": 0.0, "standard_error": None},
     }}  # fmt: skip
     (tmp_path / "fit.json").write_text(json.dumps(fit))
     tables = {"standard_errors": "fit.json", "holdout": 400}
@@ -410,6 +411,7 @@ def test_draws_follow_the_standard_errors_of_a_fit(tmp_path):
     assert np.ptp(np.asarray(drawn[0].a)) == 0.0
     (note,) = [note for note in case.notes if "standard error" in note]
     assert "fit.json has no standard error of plant.hysteresis.a, which the" in note
+    assert "before" not in note
     varied = tables | {"spread": {"plant.hysteresis.a": 0.1}}
     assert read(written(tmp_path, changed(ensemble=varied))).ensemble.notes == ()
 

@@ -10,13 +10,14 @@ from scipy import signal
 
 import piezojax as pj
 from piezojax.analysis.constraints import worst_by_plant
+from piezojax.analysis.stability.closed_poles import stable
 from piezojax.analysis.stability.small_motion import DURATION
 from piezojax.core.paths import get, replace
 from piezojax.dynamics import Modes
 from piezojax.solve.clock import Clock
 from piezojax.study import read
 from piezojax.tuning.data import make_data
-from piezojax.tuning.evaluator import Evaluator
+from piezojax.tuning.evaluator import Evaluator, _duration
 from piezojax.tuning.held_out import held_out
 from piezojax.tuning.result import Perturbed
 
@@ -81,11 +82,11 @@ def test_the_peaks_are_those_of_the_whole_oscillation(drawn):
     figures, _, damping = drawn
     found = worst_by_plant(["sensitivity_peak", "delay_margin"], figures)
     truncated = 0
-    for stable, peak, delay, each in zip(
+    for rests, peak, delay, each in zip(
         figures.stable, *found.values(), damping, strict=True
     ):
         poles, expected = poles_and_peak(each)
-        if not stable:
+        if not rests:
             assert np.isinf(peak)
             assert delay == 0.0
             continue
@@ -101,3 +102,21 @@ def test_unstable_plants_are_counted(drawn):
     assert summary.unstable == np.sum(~np.asarray(figures.stable))
     assert summary.unstable_before == 0
     assert not summary.constraints["sensitivity_peak"].kept
+
+
+def test_a_branch_that_is_not_finite_hides_no_unstable_one():
+    closed = np.stack([np.full((2, 2), np.nan), np.diag([1.2, 0.5])])
+    calm = np.stack([closed[0], np.diag([0.9, 0.5])])
+    assert stable(np.stack([closed, calm])).tolist() == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("lasts", "dt", "expected"),
+    [(0.1, 1e-3, None), (0.7, 1e-3, 1.024), (1e3, 1e-3, 2**17 * 1e-3)],
+)
+def test_the_response_lasts_as_long_as_it_must(lasts, dt, expected):
+    assert _duration(lasts, dt) == pytest.approx(expected)
+
+
+def test_a_fast_loop_keeps_its_default_duration():
+    assert _duration(0.3, 1.28e-6) == pytest.approx(DURATION, rel=1e-4)

@@ -208,29 +208,34 @@ def stability_reports(
     ``reference`` in um, ``dt`` in s. With ``axis_names`` the reference holds one number
     for each axis. On one axis the reports at ``other``, if it is another reference,
     have the names of their branches and of this reference. A loop that cannot be
-    linearised is listed in ``problems``; its error is not raised.
+    linearised at a reference is listed in ``problems``; its error is not raised.
     """
     result = StabilityReports(axis_names=axis_names)
-    points = {branch: OperatingPoint(reference, branch, dt=dt) for branch in BRANCHES}
+    places = {"": reference}
     if other not in (None, reference) and not axis_names:
-        points |= {
-            f"{branch} at {other:.4g} um": OperatingPoint(other, branch, dt=dt)
-            for branch in BRANCHES
-        }
+        places[f" at {other:.4g} um"] = other
     for name, loop in loops.items():
-        try:
-            if axis_names:
-                result.axes[name] = _both_branches(loop, [*points.values()])
+        for at, place in places.items():
+            points = [OperatingPoint(place, branch, dt=dt) for branch in BRANCHES]
+            try:
+                if axis_names:
+                    result.axes[name] = _both_branches(loop, points)
+                    continue
+                found = [linear_loop(loop, point) for point in points]
+                reports = [
+                    located_report(*one, point)
+                    for one, point in zip(found, points, strict=True)
+                ]
+            # A failed analysis must not lose the tuned gains.
+            except Exception as error:
+                why = str(error).partition("\n")[0] or type(error).__name__
+                result.problems[name + at] = why
                 continue
-            found = {at: linear_loop(loop, point) for at, point in points.items()}
-            result.reports[name] = {
-                at: located_report(*found[at], point) for at, point in points.items()
-            }
-            result.loops[name] = {b: model for b, (model, _) in found.items()}
-        # A failed analysis must not lose the tuned gains.
-        except Exception as error:
-            why = str(error).partition("\n")[0] or type(error).__name__
-            result.problems[name] = why
+            names = [branch + at for branch in BRANCHES]
+            models = [model for model, _ in found]
+            own = result.reports.setdefault(name, {}), result.loops.setdefault(name, {})
+            own[0].update(zip(names, reports, strict=True))
+            own[1].update(zip(names, models, strict=True))
     return result
 
 

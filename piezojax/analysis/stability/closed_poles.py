@@ -36,7 +36,7 @@ def stable(
 ) -> Bool[np.ndarray, "*loops"]:
     """Return whether each loop is stable on every branch.
 
-    A loop whose matrix is not finite counts as stable: nothing is known about it.
+    A branch whose matrix is not finite counts as stable: nothing is known about it.
     """
     return np.all(np.abs(_poles(closed)) <= 1.0 + ROUNDING, axis=(-2, -1))
 
@@ -56,5 +56,5 @@ def slowest_oscillation(
 
 
 def _poles(closed: np.ndarray) -> np.ndarray:
-    finite = np.isfinite(closed).all((-3, -2, -1), keepdims=True)
+    finite = np.isfinite(closed).all((-2, -1), keepdims=True)
     return np.linalg.eigvals(np.where(finite, closed, 0.0))

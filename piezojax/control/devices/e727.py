@@ -145,7 +145,7 @@ class E727(Device):
     @property
     def cautions(self) -> tuple[str, ...]:
         """Caution that the structure is assumed, if it is."""
-        if self.structure != UNKNOWN:
+        if self.structure != UNKNOWN or float(self.proportional) == 1.0:
             return ()
         return (
             "the structure of the PID of the E-727 is assumed, P multiplies all terms: "

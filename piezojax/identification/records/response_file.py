@@ -14,7 +14,9 @@ from .saved_response import stated_in
 from .touchstone import SUFFIXES, touchstone
 from .units import unit_of
 
-_FREQUENCY = re.compile(r"(?<![a-z])([a-z]?)(hz|rad/(s|sec|second|timeunit)\b)", re.I)
+_FREQUENCY = re.compile(
+    r"(?<![a-z])([a-z]?)(hz|rad[/ ](s|sec|second|timeunit)\b)", re.I
+)
 """Unit of a frequency in its name or unit: a prefix, and Hz or rad/s."""
 
 _PREFIXES = {"": 1.0, "m": 1e-3, "k": 1e3, "K": 1e3, "M": 1e6, "G": 1e9}
@@ -161,6 +163,12 @@ def _hertz(name: str, column: Column, columns: Columns, path: Path) -> float:
                 "frequency; scale it to Hz, and name it frequency_Hz"
             )
         return _PREFIXES[prefix] * (1.0 if unit.lower() == "hz" else _RADIAN)
+    stated = re.search(r"[\[(](.*?)[\])]", name)
+    if unit := column.unit or (stated and stated[1]):
+        raise ValueError(
+            f"{path}: column {name!r} is in {unit}, an unknown unit of a frequency; "
+            "scale it to Hz, and name it frequency_Hz"
+        )
     if name == "Frequency" and "ResponseData" in columns:
         raise ValueError(
             f"{path}: the unit of Frequency is not known (MATLAB's default is "

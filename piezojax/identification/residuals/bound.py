@@ -100,6 +100,14 @@ def deviations(averages: float, chance: float) -> float:
     return math.sqrt(freedom * (chance ** (-1.0 / freedom) - 1.0))
 
 
+def _unbiased(averages: float) -> float:
+    """Return the factor of a deviation from the spectra of a fit to ``averages``.
+
+    The response is fitted to the same averages as its variance.
+    """
+    return math.sqrt(averages / max(averages - 1.0, 0.5))
+
+
 def relative_error(record: Record, run: np.ndarray, part: slice) -> RelativeError:
     """Return the relative error of the free ``run`` [samples] over ``part``.
 
@@ -128,6 +136,8 @@ def relative_error(record: Record, run: np.ndarray, part: slice) -> RelativeErro
     lines = _places(own, resolution)
     kept = slice(None) if period else _stands_out(own.power, lines)
     factor = deviations(own.averages, OUTSIDE)
+    if period is None:
+        factor *= _unbiased(own.averages)
     return RelativeError(
         residual.frequency[kept],
         (np.abs(residual.response) / size)[kept],
@@ -166,7 +176,7 @@ def _closed_loop_error(
     return RelativeError(
         ratio.frequency[kept],
         np.abs(ratio.response[kept]),
-        deviations(own.averages, OUTSIDE) * deviation,
+        _unbiased(own.averages) * deviations(own.averages, OUTSIDE) * deviation,
         size,
         resolution,
         own.averages,
