@@ -18,10 +18,10 @@ from ..dynamics.linearise import sample_time
 from .estimators.free_runs import first_covering
 from .estimators.projection import excited_columns
 from .estimators.start_search import start_of
-from .fit import POOR, of_output, unexplained_shares
 from .records.record import LARGEST, Record
 from .residuals.bound import joined
 from .residuals.report import model_faults
+from .residuals.share import POOR, of_output, unexplained_shares
 
 SHARE = 0.2
 """First share of a record, on which its initial state and zero are estimated."""
