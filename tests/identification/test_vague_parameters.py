@@ -11,6 +11,7 @@ from piezojax.identification.estimators import error_problem
 from piezojax.identification.estimators import output_error as fits
 from piezojax.identification.estimators.error_problem import at_starts, problem_of
 from piezojax.identification.estimators.free_runs import starts_of
+from piezojax.identification.estimators.standard_errors import values_and_errors
 from piezojax.identification.estimators.structure import Prior
 
 DT, SAMPLES, NOISE = 1e-3, 400, 2e-2
@@ -134,7 +135,7 @@ def test_the_prior_follows_the_errors_until_they_settle():
 
 def test_the_errors_are_those_of_the_records_alone(optimum):
     assert not np.asarray(optimum.problem.prior.weights).any()
-    _, errors = fits.values_and_errors(optimum)
+    _, errors = values_and_errors(optimum)
     paths = optimum.problem.space.paths
     found = dict(zip(paths, errors, strict=True))
     # Without the prior the records tell less than it assumes about some gains.

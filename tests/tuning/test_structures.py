@@ -162,7 +162,10 @@ def test_alarms_lost_runs_and_idle_notches_come_before_errors():
     assert [r.chosen for r in rows] == [False, True, False, False]
     assert rows[0].reason.endswith("times the error of the chosen one")
     assert rows[2].reason == "no notch acts on the mode at 200 Hz"
-    assert rows[3].reason == "a run diverges or stays at a voltage limit"
+    assert (
+        rows[3].reason
+        == "the loop is unstable, or a run diverges or stays at a voltage limit"
+    )
     assert choose([Structure(notches=1, at_Hz=[], reason="not tuned")], 0.1) is None
 
 
