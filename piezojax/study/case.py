@@ -97,7 +97,7 @@ class Case:
             return TYPICAL_WIDTH if self.plant_about.small_motions else 0.0
         return given
 
-    @cached_property
+    @property
     def margin_reference(self) -> float | tuple[float, ...]:
         """Operating point of the margins of a study, um; a tuple on several axes.
 

@@ -69,7 +69,9 @@ def make_amplifier(study: Study) -> System | None:
     table = study.actuator
 
     def parts(axis: int) -> Parts:
-        return _response(study, "actuator", table, axis, 1, table.computation)
+        return _response(
+            study, "actuator", table, axis, order=1, samples=table.computation
+        )
 
     given = any(parts(axis) for axis in range(study.axis_count))
     return _systems(study, parts) if given else None
@@ -97,7 +99,7 @@ def make_sensor(study: Study) -> System:
 
     def parts(axis: int) -> Parts:
         found: Parts = {}
-        response = _response(study, "sensor", table, axis, 3)
+        response = _response(study, "sensor", table, axis, order=3)
         if response:
             found["response"] = SensorResponse(series(**response))
         found["noise"] = Sensor(_of(table.noise_rms, axis))

@@ -59,37 +59,26 @@ def _ranges(study: Study, loop: Feedback) -> tuple[dict[str, Range], tuple[str, 
     for path in tables.keys() - study.parameters.keys():
         bounds = _reaching(ranges[path], float(get(loop, path)))
         ranges[path] = bounds.limited(declared(loop, path))
-    switched_off = [
-        path
-        for path in tables.keys() - {*study.parameters, *study.tune}
-        if ranges[path].scale != "linear" and float(get(loop, path)) == 0.0
-    ]
-    ranges |= {
-        path: dataclasses.replace(ranges[path], start=ranges[path].lower)
-        for path in switched_off
-    }
-    # The frequency of a filter that is off may be any.
-    beyond = [
-        path
-        for path in tables.keys() - {*study.parameters, *study.tune}
-        if (known := declared(loop, path)) is not None
-        and known.switched
-        and float(get(loop, path)) > ranges[path].upper
-    ]
-    ranges |= {
-        path: dataclasses.replace(ranges[path], start=ranges[path].upper)
-        for path in beyond
-    }
-    notes = tuple(
-        f"{path} is above half the sampling rate; the search starts from its upper "
-        f"bound, {ranges[path].upper:g}"
-        for path in sorted(beyond)
-    ) + tuple(
-        f"{path} is 0 in the controller, outside its {ranges[path].scale} scale; "
-        f"the search starts from its lower bound, {ranges[path].lower:g}"
-        for path in sorted(switched_off)
-    )
-    return ranges, notes
+    notes = []
+    for path in sorted(tables.keys() - {*study.parameters, *study.tune}):
+        bounds, value, known = (
+            ranges[path],
+            float(get(loop, path)),
+            declared(loop, path),
+        )
+        if bounds.scale != "linear" and value == 0.0:
+            start, bound = bounds.lower, "lower"
+            why = f"0 in the controller, outside its {bounds.scale} scale"
+        elif known is not None and known.switched and value > bounds.upper:
+            # The frequency of a filter that is off may be any.
+            start, bound, why = bounds.upper, "upper", "above half the sampling rate"
+        else:
+            continue
+        ranges[path] = dataclasses.replace(bounds, start=start)
+        notes.append(
+            f"{path} is {why}; the search starts from its {bound} bound, {start:g}"
+        )
+    return ranges, tuple(notes)
 
 
 def _range(loop: Feedback, path: str, table: TunedTable) -> Range:
