@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..analysis.stability import OperatingPoint
-from ..analysis.stability.closed_poles import closed_matrices, stable
+from ..analysis.stability.closed_poles import closed_matrices, poles_of, stable
 from ..analysis.stability.sampled_margins import peak_of
 from ..analysis.stability.small_motion import sensitivities
 from ..core.axes import PerAxisMetric, packed
@@ -217,5 +217,5 @@ def _worse_peak(peaks: Any, closed: Any) -> np.ndarray:
     circle, and NaN if ``closed`` is not finite.
     """
     peaks, closed = np.asarray(peaks), np.asarray(closed)
-    worse = np.where(stable(closed), peaks.max(axis=-1), np.inf)
+    worse = np.where(stable(poles_of(closed)), peaks.max(axis=-1), np.inf)
     return np.where(np.isfinite(closed).all((-3, -2, -1)), worse, np.nan)

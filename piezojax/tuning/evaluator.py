@@ -19,6 +19,7 @@ from ..analysis.constraints import (
 )
 from ..analysis.stability.closed_poles import (
     closed_matrices,
+    poles_of,
     slowest_oscillation,
     stable,
 )
@@ -76,8 +77,8 @@ class Evaluator:
     ``start`` is the first sample that counts, ``limits`` are those of the study,
     ``model_error`` [lines] bounds the relative error of the plant if its record gives
     a bound; ``step_test`` evaluates the limits on steps. ``margin_stages`` are those on
-    which margins are limited, None for the loop's own alone. ``clock`` measures the
-    compile time.
+    which margins are limited, None for the loop's own alone and without such a limit.
+    ``clock`` measures the compile time.
     """
 
     def __init__(self, clock: Clock, case: Case):
@@ -87,7 +88,8 @@ class Evaluator:
         self.limits = study.limits
         bound = case.plant_about.error_bound
         self.model_error = bound and as_array(bound.supported(lines(study.dt)))
-        self.margin_stages = drawn_stages(case, "margins")
+        margins = uses(self.limits, "margins")
+        self.margin_stages = drawn_stages(case, "margins") if margins else None
         self.step_test = step_test_of(case)
         # A program takes no more plants than the study draws.
         drawn = study.ensemble.holdout if study.ensemble else 1
@@ -131,9 +133,10 @@ class Evaluator:
         if margin_stages is None:
             margins = self._margins(loop, None)
             return LoopFigures(tracking, extremes, margins, steps, dt)
-        closed = np.asarray(self._on_margin_stages(_closed_on, loop, margin_stages))
-        known = stable(closed)
-        lasts = SETTLED * dt * np.max(slowest_oscillation(closed)[known], initial=0.0)
+        closed = self._on_margin_stages(_closed_on, loop, margin_stages)
+        poles = poles_of(np.asarray(closed))
+        known = stable(poles)
+        lasts = SETTLED * dt * np.max(slowest_oscillation(poles)[known], initial=0.0)
         margins = self._margins(loop, margin_stages, _duration(lasts, dt))
         margins = margins and without_unstable(margins, known)
         return LoopFigures(tracking, extremes, margins, steps, dt, known)
@@ -231,14 +234,11 @@ class Evaluator:
 def _runs_on(
     stages: Stage, loop: Feedback, signals: Signals, start: int, beside: Metric | None
 ) -> Any:
-    dynamic, static = eqx.partition(stages, eqx.is_array)
-
-    def one(part):
-        stage = eqx.combine(part, static)
+    def one(stage: Stage) -> Any:
         around, own = stage.around(loop), signals.on(stage)
         return evaluate(lambda x: x, around, own, start, beside)
 
-    return jax.lax.map(one, dynamic)
+    return _of_each(one, stages)
 
 
 @eqx.filter_jit
@@ -258,13 +258,14 @@ def _margins_on(
 @eqx.filter_jit
 def _closed_on(stages: Stage, loop: Feedback, reference: Array, dt: float) -> Array:
     """Return the matrices of ``closed_matrices`` on each of ``stages``."""
-    dynamic, static = eqx.partition(stages, eqx.is_array)
     point = OperatingPoint(reference, dt=dt)
+    return _of_each(lambda stage: closed_matrices(stage.around(loop), point), stages)
 
-    def one(part: Any) -> Array:
-        return closed_matrices(_around(loop)(eqx.combine(part, static)), point)
 
-    return jax.lax.map(one, dynamic)
+def _of_each(function: Callable[[Stage], Any], stages: Stage) -> Any:
+    """Return ``function`` of each of the stacked ``stages``, one after another."""
+    dynamic, static = eqx.partition(stages, eqx.is_array)
+    return jax.lax.map(lambda part: function(eqx.combine(part, static)), dynamic)
 
 
 def _duration(lasts: float, dt: float) -> float | None:

@@ -6,7 +6,7 @@ from importlib.metadata import version
 import jax
 import numpy as np
 
-from ..analysis.constraints import LoopFigures, uses, worst_by_plant
+from ..analysis.constraints import LoopFigures, worst_by_plant
 from ..core.arrays import as_array
 from ..core.feedback import Feedback
 from ..core.metrics import TrackingFigures
@@ -145,9 +145,9 @@ def constraint_outcomes(
     objective: Objective, evaluator: Evaluator, after: Feedback
 ) -> dict[str, ConstraintOutcome]:
     """Return the outcomes of the limits on the plants that were tuned on."""
-    margins = uses(evaluator.limits, "margins")
-    stages = evaluator.margin_stages if margins else None
-    figures = evaluator.limited(after, objective.signals, objective.stages, stages)
+    figures = evaluator.limited(
+        after, objective.signals, objective.stages, evaluator.margin_stages
+    )
     return _outcomes(evaluator.limits, evaluator.limits, figures)
 
 

@@ -157,6 +157,19 @@ class StabilityReports:
     axes: dict[str, AxesStability] = field(default_factory=dict)
     axis_names: tuple[str, ...] = ()
 
+    def add(
+        self, name: str, at: str, loop: Feedback, points: Sequence[OperatingPoint]
+    ) -> None:
+        """Add ``loop`` of one axis at ``points``; ``at`` follows their branches."""
+        found = {point.branch + at: linear_loop(loop, point) for point in points}
+        reports = {
+            key: located_report(*one, point)
+            for (key, one), point in zip(found.items(), points, strict=True)
+        }
+        self.reports.setdefault(name, {}).update(reports)
+        models = {key: model for key, (model, _) in found.items()}
+        self.loops.setdefault(name, {}).update(models)
+
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON, by name.
 
@@ -220,22 +233,12 @@ def stability_reports(
             try:
                 if axis_names:
                     result.axes[name] = _both_branches(loop, points)
-                    continue
-                found = [linear_loop(loop, point) for point in points]
-                reports = [
-                    located_report(*one, point)
-                    for one, point in zip(found, points, strict=True)
-                ]
+                else:
+                    result.add(name, at, loop, points)
             # A failed analysis must not lose the tuned gains.
             except Exception as error:
                 why = str(error).partition("\n")[0] or type(error).__name__
                 result.problems[name + at] = why
-                continue
-            names = [branch + at for branch in BRANCHES]
-            models = [model for model, _ in found]
-            own = result.reports.setdefault(name, {}), result.loops.setdefault(name, {})
-            own[0].update(zip(names, reports, strict=True))
-            own[1].update(zip(names, models, strict=True))
     return result
 
 

@@ -7,7 +7,7 @@ import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Complex, Float
 
 from ...core.feedback import Feedback
 from .broken_loop import open_loop
@@ -31,30 +31,32 @@ def closed_matrices(
     return jnp.stack([model.A - model.B @ model.C for model in models])
 
 
-def stable(
+def poles_of(
     closed: Float[np.ndarray, "*loops branches n n"],
+) -> Complex[np.ndarray, "*loops branches n"]:
+    """Return the poles of each loop on every branch; 0 where a matrix is not finite."""
+    finite = np.isfinite(closed).all((-2, -1), keepdims=True)
+    return np.linalg.eigvals(np.where(finite, closed, 0.0)).astype(complex)
+
+
+def stable(
+    poles: Complex[np.ndarray, "*loops branches n"],
 ) -> Bool[np.ndarray, "*loops"]:
     """Return whether each loop is stable on every branch.
 
     A branch whose matrix is not finite counts as stable: nothing is known about it.
     """
-    return np.all(np.abs(_poles(closed)) <= 1.0 + ROUNDING, axis=(-2, -1))
+    return np.all(np.abs(poles) <= 1.0 + ROUNDING, axis=(-2, -1))
 
 
 def slowest_oscillation(
-    closed: Float[np.ndarray, "*loops branches n n"],
+    poles: Complex[np.ndarray, "*loops branches n"],
 ) -> Float[np.ndarray, "*loops"]:
     """Return the longest time constant of a decaying oscillation, in samples.
 
     It is 0 for a loop without one.
     """
-    poles = _poles(closed)
     size = np.abs(poles)
     counts = (np.abs(np.angle(poles)) > OSCILLATES) & (size < 1.0) & (size > 0.0)
     decay = -np.log(np.where(counts, size, 0.5))
     return np.max(np.where(counts, 1.0 / decay, 0.0), axis=(-2, -1))
-
-
-def _poles(closed: np.ndarray) -> np.ndarray:
-    finite = np.isfinite(closed).all((-2, -1), keepdims=True)
-    return np.linalg.eigvals(np.where(finite, closed, 0.0))
