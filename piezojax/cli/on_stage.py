@@ -69,7 +69,7 @@ def learning_law(results: Path, named: Path | None) -> "LearningFilter":
     case, loop = load_loop(results, named)
     bound = case.plant_about.error_bound
     reference = float(np.max(case.margin_reference))
-    return learning_filter(loop, reference, case.study.dt, bound)
+    return learning_filter(loop, reference, case.study.dt, bound, case.margin_duration)
 
 
 @contextmanager

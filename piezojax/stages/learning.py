@@ -109,7 +109,11 @@ class LearningFilter:
 
 
 def learning_filter(
-    loop: Feedback, highest: float, dt: float, bound: ErrorBound | None = None
+    loop: Feedback,
+    highest: float,
+    dt: float,
+    bound: ErrorBound | None = None,
+    duration: float | None = None,
 ) -> LearningFilter:
     """Return the filter of ``loop``, an inverse as far as its plant is known.
 
@@ -118,12 +122,13 @@ def learning_filter(
     e is corrected by e / T. If the plant has the relative error d, that of T is |S| d,
     and |S| d e remains of e after a run. The correction is therefore multiplied by
     1 / (1 + (|S| d / TRUSTED)^2), and limited to LARGEST times the error. d is
-    ``bound``, or ASSUMED without one. For one axis.
+    ``bound``, or ASSUMED without one. ``duration`` (s) is that of ``sensitivity``. For
+    one axis.
     """
     point = OperatingPoint(np.asarray(highest), dt=dt)
-    followed = np.mean(np.asarray(references_followed(loop, point)), axis=0)
-    sensitivity = np.abs(np.asarray(sensitivities(loop, point))[..., 0, 0])
-    at = lines(dt)
+    followed = np.mean(np.asarray(references_followed(loop, point, duration)), axis=0)
+    sensitivity = np.abs(np.asarray(sensitivities(loop, point, duration))[..., 0, 0])
+    at = lines(dt, duration)
     unknown = np.full(len(at), ASSUMED) if bound is None else bound.at(at)
     left = np.max(sensitivity, axis=0) * unknown
     trust = 1.0 / (1.0 + (left / TRUSTED) ** 2)

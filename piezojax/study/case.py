@@ -11,6 +11,8 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from ..analysis.stability.closed_poles import poles_of, slowest_oscillation
+from ..analysis.stability.small_motion import duration_of
 from ..catalog import CONTROLLERS, PLANTS
 from ..control.design_model import NoInverseError
 from ..core.about import About
@@ -19,7 +21,8 @@ from ..core.feedback import Feedback, Observation
 from ..core.paths import declared, get, replace, static_fields
 from ..core.progress import Progress, Silent
 from ..core.space import Space
-from ..core.system import System, accepts, rest_output
+from ..core.system import System, accepts, resolve, rest_output
+from ..dynamics.linearise import linearise
 from ..identification import Fit
 from ..identification.residual_record import ResidualRecord, load_residual
 from ..identification.response_model import ResponseModel
@@ -36,6 +39,11 @@ from .schema import Study
 from .sources import about_file, source_error, system_of
 from .study_file import contents_of, load, sha256_of
 from .trajectories import read_trajectories
+
+SEARCHED, MOST_SEARCHED = 4.0, 2**15
+"""Time constants of the plant's slowest oscillation in the impulse responses of a
+search, after which 2 % of a peak is missing, and the most samples of these responses: a
+gradient stores them."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +118,18 @@ class Case:
     def nearer_reference(self) -> float | tuple[float, ...]:
         """The other end of the range of all references, as ``margin_reference``."""
         return self._ends[1]
+
+    @cached_property
+    def margin_duration(self) -> float:
+        """Length of the impulse responses of margins in searches and sweeps, s.
+
+        It follows from the slowest oscillation of the plant about 0 V. It must be known
+        before a program uses it.
+        """
+        dt, rest = self.study.dt, as_signal(np.zeros(np.shape(self.margin_reference)))
+        matrix = linearise(resolve(self.loop.plant), rest, dt=dt).A
+        slowest = slowest_oscillation(poles_of(np.asarray(matrix)[None])).item()
+        return duration_of(dt * slowest, dt, SEARCHED, MOST_SEARCHED)
 
     @cached_property
     def _ends(self) -> tuple[Any, Any]:

@@ -42,10 +42,12 @@ class Simulator:
         self.plants = plants_of(case)
         self.references = references_of(study)
         self.metrics, self.every = table.metrics, table.every
-        if SENSITIVITY in self.metrics and study.axes:
-            raise ValueError(
-                f"sweep.metrics: {SENSITIVITY} needs a stage with one axis"
-            )
+        if SENSITIVITY in self.metrics:
+            if study.axes:
+                raise ValueError(
+                    f"sweep.metrics: {SENSITIVITY} needs a stage with one axis"
+                )
+            self._margin_duration = case.margin_duration
         data = make_data(case).holdout
         names = (*study.references.tune, *study.references.unseen)
         chosen = np.array([names.index(name) for name in self.references])
@@ -134,7 +136,8 @@ class Simulator:
     def _peaks(self, loop: Feedback) -> tuple[Array, Array]:
         """Return Ms and the state matrix of the closed loop, both for every branch."""
         point = OperatingPoint(self.case.margin_reference, dt=self.case.study.dt)
-        peaks = jax.vmap(peak_of)(sensitivities(loop, point))
+        found = sensitivities(loop, point, self._margin_duration)
+        peaks = jax.vmap(peak_of)(found)
         return peaks, closed_matrices(loop, point)
 
     def _program(self, device: Any, plant: str) -> Callable:

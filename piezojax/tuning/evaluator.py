@@ -24,7 +24,7 @@ from ..analysis.stability.closed_poles import (
     stable,
 )
 from ..analysis.stability.operating_point import OperatingPoint
-from ..analysis.stability.small_motion import default_duration, lines
+from ..analysis.stability.small_motion import duration_of, lines
 from ..analysis.step_response import StepFigures, step_ends
 from ..core.arrays import as_array
 from ..core.feedback import Feedback
@@ -47,12 +47,10 @@ default number of an ensemble and the nominal plant."""
 CARRIED = 16
 """Number of plants whose margins a search computes if there are more than ``EVERY``."""
 
-SETTLED = 7.0
-"""Time constants of an oscillation after which 0.1 % of it is left."""
-
-MOST = 2**17
-"""Most samples of an impulse response. One that lasts longer is truncated; the poles
-tell whether the loop is stable."""
+SETTLED, MOST = 7.0, 2**17
+"""Time constants of an oscillation after which 0.1 % of it is left, and the most
+samples of an impulse response. One that lasts longer is truncated; the poles tell
+whether the loop is stable."""
 
 RUN_BLOCK = 8
 """Plants on which runs are simulated in one call of a program."""
@@ -87,7 +85,8 @@ class Evaluator:
         self.start = study.settled
         self.limits = study.limits
         bound = case.plant_about.error_bound
-        self.model_error = bound and as_array(bound.supported(lines(study.dt)))
+        frequency = lines(study.dt, case.margin_duration)
+        self.model_error = bound and as_array(bound.supported(frequency))
         margins = uses(self.limits, "margins")
         self.margin_stages = drawn_stages(case, "margins") if margins else None
         self.step_test = step_test_of(case)
@@ -136,8 +135,9 @@ class Evaluator:
         closed = self._on_margin_stages(_closed_on, loop, margin_stages)
         poles = poles_of(np.asarray(closed))
         known = stable(poles)
-        lasts = SETTLED * dt * np.max(slowest_oscillation(poles)[known], initial=0.0)
-        margins = self._margins(loop, margin_stages, _duration(lasts, dt))
+        slowest = dt * np.max(slowest_oscillation(poles)[known], initial=0.0)
+        duration = duration_of(slowest, dt, SETTLED, MOST)
+        margins = self._margins(loop, margin_stages, duration)
         margins = margins and without_unstable(margins, known)
         return LoopFigures(tracking, extremes, margins, steps, dt, known)
 
@@ -196,15 +196,20 @@ class Evaluator:
         return Carried(float(by[worst[0]]), carried, places)
 
     def _margins(
-        self, loop: Feedback, stages: Stage | None, duration: float | None = None
+        self, loop: Feedback, stages: Stage | None, duration: float = 0.0
     ) -> MarginFigures | None:
-        """Return the margins on each of ``stages``, or None if no limit needs them."""
+        """Return the margins on each of ``stages``, or None if no limit needs them.
+
+        The impulse responses last for ``duration`` (s), and as long as in a search.
+        """
         if not uses(self.limits, "margins"):
             return None
         bound, error = self._case.plant_about.error_bound, self.model_error
-        if bound is not None and duration is not None:
+        searched = self._case.margin_duration
+        if bound is not None and duration > searched:
             frequency = lines(self._case.study.dt, duration)
             error = as_array(bound.supported(frequency))
+        duration = max(duration, searched)
         stages = own_stage(loop) if stages is None else stages
         limits = tuple(self.limits)
         return self._on_margin_stages(
@@ -249,7 +254,7 @@ def _margins_on(
     dt: float,
     limits: tuple[str, ...],
     model_error: Array | None,
-    duration: float | None,
+    duration: float,
 ) -> MarginFigures:
     point = OperatingPoint(reference, dt=dt)
     return margins_on(limits, _around(loop), stages, point, model_error, duration)
@@ -266,15 +271,6 @@ def _of_each(function: Callable[[Stage], Any], stages: Stage) -> Any:
     """Return ``function`` of each of the stacked ``stages``, one after another."""
     dynamic, static = eqx.partition(stages, eqx.is_array)
     return jax.lax.map(lambda part: function(eqx.combine(part, static)), dynamic)
-
-
-def _duration(lasts: float, dt: float) -> float | None:
-    """Return the default duration (s), None, or a longer one, of few different ones."""
-    default = default_duration(dt)
-    if lasts <= default:
-        return None
-    longer = default * 2.0 ** np.ceil(np.log2(lasts / default))
-    return float(max(default, min(longer, MOST * dt)))
 
 
 @eqx.filter_jit

@@ -50,6 +50,7 @@ def make_objective(
         over=table.ensemble.aggregate if table.ensemble else "mean",
         tail=table.ensemble.tail if table.ensemble else 1.0,
         margin_reference=as_array(case.margin_reference),
+        margin_duration=case.margin_duration,
         step_test=evaluator.step_test,
         dt=table.dt,
     )

@@ -175,7 +175,7 @@ def _program(outcome: Outcome) -> tuple[Callable, np.ndarray]:
     step = np.where(np.arange(samples) > kept[0], after, before)
     signals = _with_run(signals, as_array(step), outcome)
     point = OperatingPoint(case.margin_reference, dt=study.dt)
-    names = [margin.constraint for margin in MARGINS.values()]
+    names, duration = [m.constraint for m in MARGINS.values()], case.margin_duration
 
     def one(unit: jax.Array) -> tuple[jax.Array, ...]:
         around = space.put(loop, unit)
@@ -183,7 +183,7 @@ def _program(outcome: Outcome) -> tuple[Callable, np.ndarray]:
             lambda loop: loop, around, signals, start, every=every
         )
         assert errors is not None
-        of = margin_figures(names, around, point, None)
+        of = margin_figures(names, around, point, None, duration)
         margins = jnp.stack([m.worst(of[m.constraint]) for m in MARGINS.values()])
         tracking = errors[:-1].reshape(len(errors) - 1, -1)
         rms = jnp.sqrt(jnp.mean(figures.rms_error[:-1] ** 2, axis=1))

@@ -130,11 +130,11 @@ class Objective(eqx.Module):
 
     ``limits`` are the limits of constraints by name (``constraints.CONSTRAINTS``). They
     must hold on every stage; limits on margins must hold on every one of
-    ``margin_stages``, at ``margin_reference`` (um). The limits on Ms and the delay
-    margin must also hold for all plants within the relative error ``model_error``
-    [lines] of these stages. ``step_test`` evaluates the limits on steps, None on
-    several axes. ``loss`` is an augmented Lagrangian with ``multipliers`` and
-    ``penalty``.
+    ``margin_stages``, at ``margin_reference`` (um), from impulse responses of
+    ``margin_duration`` (s). The limits on Ms and the delay margin must also hold for
+    all plants within the relative error ``model_error`` [lines] of these stages.
+    ``step_test`` evaluates the limits on steps, None on several axes. ``loss`` is an
+    augmented Lagrangian with ``multipliers`` and ``penalty``.
     """
 
     loop: Feedback
@@ -155,6 +155,7 @@ class Objective(eqx.Module):
     slew_weight: float = eqx.field(static=True, default=0.0)
     limits: dict[str, Array] = eqx.field(default_factory=dict)
     margin_reference: Array | None = None
+    margin_duration: float | None = eqx.field(static=True, default=None)
     step_test: StepTest | None = None
     dt: float = eqx.field(static=True, default=1.0)
     multipliers: Float[Array, " constraints"] = eqx.field(
@@ -227,6 +228,7 @@ class Objective(eqx.Module):
                 self.margin_stages,
                 OperatingPoint(self.margin_reference, dt=self.dt),
                 self.model_error,
+                self.margin_duration,
             )
         steps = None
         if self.step_test is not None and uses(self.limits, "steps"):

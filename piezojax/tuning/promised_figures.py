@@ -64,7 +64,8 @@ def promised_figures(
     limits = tuple(n for n in study.limits if CONSTRAINTS[n].source == "margins")
     if limits:
         reference = as_array(case.margin_reference)
-        values, slope_of = _margins(unknowns, loop, limits, reference, study.dt, start)
+        times = study.dt, case.margin_duration
+        values, slope_of = _margins(unknowns, loop, limits, reference, *times, start)
         for name in limits:
             slope = np.asarray(slope_of[name])
             value = float(np.exp(values[name]))
@@ -106,6 +107,7 @@ def _margins(
     limits: tuple[str, ...],
     reference: Array,
     dt: float,
+    duration: float,
     changes: Array,
 ) -> tuple[dict[str, Array], dict[str, Array]]:
     """Return the logarithms of the worst margins, and their derivatives [n]."""
@@ -113,7 +115,7 @@ def _margins(
     def logarithms(changes: Array) -> tuple[dict[str, Array], dict[str, Array]]:
         changed = dataclasses.replace(loop, plant=unknowns.at(changes))
         point = OperatingPoint(reference, dt=dt)
-        margins = margins_on(limits, lambda _: changed, None, point, None)
+        margins = margins_on(limits, lambda _: changed, None, point, None, duration)
         found = {
             name: jnp.log(CONSTRAINTS[name].worst(margins[name])) for name in limits
         }

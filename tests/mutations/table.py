@@ -603,9 +603,16 @@ MUTATIONS = (
     Mutation(
         "margins of a slow oscillation from its first 0.2 s",
         "tuning/evaluator.py",
-        "SETTLED = 7.0",
-        "SETTLED = 0.0",
+        "SETTLED, MOST = 7.0,",
+        "SETTLED, MOST = 0.0,",
         ("tests/tuning/test_slow_modes.py",),
+    ),
+    Mutation(
+        "a search with the first 0.2 s of a slow oscillation",
+        "study/case.py",
+        "SEARCHED, MOST_SEARCHED = 4.0,",
+        "SEARCHED, MOST_SEARCHED = 0.0,",
+        ("tests/tuning/test_slow_modes.py", "-k", "search"),
     ),
     Mutation(
         "gains without the alarms of the plant that a study accepts",

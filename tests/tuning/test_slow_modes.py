@@ -11,15 +11,16 @@ from scipy import signal
 import piezojax as pj
 from piezojax.analysis.constraints import worst_by_plant
 from piezojax.analysis.stability.closed_poles import poles_of, stable
-from piezojax.analysis.stability.small_motion import DURATION
+from piezojax.analysis.stability.small_motion import DURATION, duration_of
 from piezojax.core.paths import get, replace
 from piezojax.dynamics import Modes
 from piezojax.solve.clock import Clock
 from piezojax.study import read
 from piezojax.tuning.data import make_data
-from piezojax.tuning.evaluator import Evaluator, _duration
+from piezojax.tuning.evaluator import MOST, SETTLED, Evaluator
 from piezojax.tuning.held_out import held_out
 from piezojax.tuning.result import Perturbed
+from piezojax.tuning.tuner import tune
 
 DT, FREQUENCY, GAIN, INTEGRAL = 1e-3, 50.0, 0.1, 11.6
 STUDY = {
@@ -40,12 +41,18 @@ STUDY = {
 
 
 @pytest.fixture(scope="module")
-def drawn(tmp_path_factory):
-    """Return the figures on the held-out plants, and their damping ratios."""
+def folder(tmp_path_factory):
+    """Return a folder with the model of the stage."""
     folder = tmp_path_factory.mktemp("slow")
     modes = Modes([FREQUENCY], [4e-3], DT, [], [])
     system = pj.series(gain=pj.core.system.Affine(GAIN), dynamics=modes)
     pj.save(system, folder / "model.json", pj.About(rate_Hz=1.0 / DT))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def drawn(folder):
+    """Return the figures on the held-out plants, and their damping ratios."""
     (folder / "study.toml").write_text(tomli_w.dumps(STUDY))
     case = read(folder / "study.toml")
     own = held_out(case, Evaluator(Clock(), case), make_data(case))
@@ -55,14 +62,14 @@ def drawn(tmp_path_factory):
     return own.perturbed, gentle.perturbed, damping
 
 
-def poles_and_peak(damping):
+def poles_and_peak(damping, integral=INTEGRAL):
     """Return the closed-loop poles and max |S| of one plant."""
     w = 2.0 * np.pi * FREQUENCY
     held = signal.cont2discrete(
         ([GAIN * w**2], [1.0, 2.0 * damping * w, w**2]), DT, "zoh"
     )
     plant, own = held[0].ravel(), held[1]
-    forward = INTEGRAL * DT * np.polymul([1.0, 0.0], plant)
+    forward = integral * DT * np.polymul([1.0, 0.0], plant)
     back = np.polymul([1.0, -1.0], own)
     poles = np.roots(np.polyadd(forward, back))
     angle = np.linspace(0.2, 0.5, 400_000)
@@ -96,6 +103,23 @@ def test_the_peaks_are_those_of_the_whole_oscillation(drawn):
     assert truncated > 3  # 0.2 s would not show these
 
 
+def test_a_search_keeps_the_limit_that_the_poles_show(folder):
+    """An impulse response of 0.512 s hides that the first gain is unstable."""
+    table = {
+        **STUDY,
+        "constraints": {"sensitivity_peak": 2.0},
+        "optimiser": {"starts": 2, "candidates": 8},
+    }
+    del table["ensemble"]
+    (folder / "search.toml").write_text(tomli_w.dumps(table))
+    case = read(folder / "search.toml")
+    assert case.margin_duration == pytest.approx(8 * 0.512)  # over 4 / (0.004 w)
+    found = tune(case).result
+    integral = found.gains["controller.integral"]
+    _, peak = poles_and_peak(4e-3, integral)
+    assert 1.9 < peak < 2.0 * 1.001
+
+
 def test_unstable_plants_are_counted(drawn):
     figures, gentle, _ = drawn
     summary = Perturbed.of(gentle, figures, np.array([True]), {"sensitivity_peak": 2.0})
@@ -112,12 +136,13 @@ def test_a_branch_that_is_not_finite_hides_no_unstable_one():
 
 
 @pytest.mark.parametrize(
-    ("lasts", "dt", "expected"),
-    [(0.1, 1e-3, None), (0.7, 1e-3, 1.024), (1e3, 1e-3, 2**17 * 1e-3)],
+    ("time_constant", "dt", "expected"),
+    [(0.07, 1e-3, 0.512), (0.1, 1e-3, 1.024), (1e3, 1e-3, 2**17 * 1e-3)],
 )
-def test_the_response_lasts_as_long_as_it_must(lasts, dt, expected):
-    assert _duration(lasts, dt) == pytest.approx(expected)
+def test_the_response_lasts_as_long_as_it_must(time_constant, dt, expected):
+    assert duration_of(time_constant, dt, SETTLED, MOST) == pytest.approx(expected)
 
 
 def test_a_fast_loop_keeps_its_default_duration():
-    assert _duration(0.3, 1.28e-6) == pytest.approx(DURATION, rel=1e-4)
+    found = duration_of(0.04, 1.28e-6, SETTLED, MOST)
+    assert found == pytest.approx(DURATION, rel=1e-4)

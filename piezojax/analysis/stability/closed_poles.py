@@ -1,4 +1,4 @@
-"""Stability of many loops, from the poles of their closed loops.
+"""Stability and slowest oscillations of many loops, from poles.
 
 NumPy computes the poles, because LAPACK calls of XLA may deadlock on a CPU.
 """
@@ -32,11 +32,11 @@ def closed_matrices(
 
 
 def poles_of(
-    closed: Float[np.ndarray, "*loops branches n n"],
-) -> Complex[np.ndarray, "*loops branches n"]:
-    """Return the poles of each loop on every branch; 0 where a matrix is not finite."""
-    finite = np.isfinite(closed).all((-2, -1), keepdims=True)
-    return np.linalg.eigvals(np.where(finite, closed, 0.0)).astype(complex)
+    matrices: Float[np.ndarray, "*systems n n"],
+) -> Complex[np.ndarray, "*systems n"]:
+    """Return the poles of systems; 0 for those whose matrix is not finite."""
+    finite = np.isfinite(matrices).all((-2, -1), keepdims=True)
+    return np.linalg.eigvals(np.where(finite, matrices, 0.0)).astype(complex)
 
 
 def stable(
@@ -50,13 +50,13 @@ def stable(
 
 
 def slowest_oscillation(
-    poles: Complex[np.ndarray, "*loops branches n"],
-) -> Float[np.ndarray, "*loops"]:
+    poles: Complex[np.ndarray, "*systems n"],
+) -> Float[np.ndarray, "*systems"]:
     """Return the longest time constant of a decaying oscillation, in samples.
 
-    It is 0 for a loop without one.
+    It is 0 for a system without one.
     """
     size = np.abs(poles)
     counts = (np.abs(np.angle(poles)) > OSCILLATES) & (size < 1.0) & (size > 0.0)
     decay = -np.log(np.where(counts, size, 0.5))
-    return np.max(np.where(counts, 1.0 / decay, 0.0), axis=(-2, -1))
+    return np.max(np.where(counts, 1.0 / decay, 0.0), axis=-1, initial=0.0)

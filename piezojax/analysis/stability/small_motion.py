@@ -166,6 +166,19 @@ def default_duration(dt: float) -> float:
     return dt * max(round(DURATION / dt), LEAST)
 
 
+def duration_of(time_constant: float, dt: float, settled: float, most: int) -> float:
+    """Return the length (s) of an impulse response that ends with an oscillation.
+
+    It is at least the default one, and at least ``settled`` times the ``time_constant``
+    (s) of the oscillation unless that is more than ``most`` samples. Longer ones are
+    the default times a power of two: few programs serve all.
+    """
+    default = default_duration(dt)
+    longer = max(1.0, settled * time_constant / default)
+    longer = default * 2.0 ** math.ceil(math.log2(longer))
+    return max(default, min(longer, most * dt))
+
+
 def _samples(dt: float, duration: float | None) -> int:
     return round((default_duration(dt) if duration is None else duration) / dt)
 
