@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ..analysis.constraints import LoopFigures, worst_by_plant
+from ..analysis.constraints import worst_by_plant
+from ..analysis.loop_figures import LoopFigures
 from ..core.progress import Progress
 from ..study import Case
 from .alarms import PEAK

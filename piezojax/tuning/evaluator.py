@@ -11,12 +11,11 @@ from jaxtyping import Array
 
 from ..analysis.constraints import (
     CONSTRAINTS,
-    LoopFigures,
-    MarginFigures,
     uses,
     without_unstable,
     worst_excess,
 )
+from ..analysis.loop_figures import LoopFigures, MarginFigures
 from ..analysis.stability.closed_poles import (
     closed_matrices,
     poles_of,

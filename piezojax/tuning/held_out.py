@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from ..analysis.constraints import LoopFigures
+from ..analysis.loop_figures import LoopFigures
 from ..core.feedback import Feedback
 from ..study import Case, Stage
 from .data import Data

@@ -6,7 +6,8 @@ from importlib.metadata import version
 import jax
 import numpy as np
 
-from ..analysis.constraints import LoopFigures, worst_by_plant
+from ..analysis.constraints import worst_by_plant
+from ..analysis.loop_figures import LoopFigures
 from ..core.arrays import as_array
 from ..core.feedback import Feedback
 from ..core.metrics import TrackingFigures

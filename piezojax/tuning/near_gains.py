@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.stats.qmc
 
-from ..analysis.constraints import CONSTRAINTS, margin_figures
+from ..analysis.constraints import CONSTRAINTS
+from ..analysis.loop_figures import margin_figures
 from ..analysis.stability.operating_point import OperatingPoint
 from ..analysis.step_response import NAMES, step_ends
 from ..core.arrays import as_array

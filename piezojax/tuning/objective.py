@@ -11,13 +11,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..analysis.constraints import (
-    LoopFigures,
-    MarginFigures,
     constraint_count,
-    margin_figures,
     uses,
     violations,
 )
+from ..analysis.loop_figures import LoopFigures, MarginFigures, margin_figures
 from ..analysis.stability.operating_point import OperatingPoint
 from ..analysis.step_response import StepFigures, step_figures
 from ..core.arrays import as_array, largest

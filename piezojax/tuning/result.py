@@ -8,7 +8,8 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from ..analysis.constraints import CONSTRAINTS, LoopFigures, worst_by_plant
+from ..analysis.constraints import CONSTRAINTS, worst_by_plant
+from ..analysis.loop_figures import LoopFigures
 from ..analysis.stability.measured_margins import MeasuredMargins
 from ..core.about import About
 from ..core.feedback import Feedback

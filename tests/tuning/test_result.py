@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from piezojax.analysis.constraints import LoopFigures
+from piezojax.analysis.loop_figures import LoopFigures
 from piezojax.core.metrics import TrackingFigures
 from piezojax.tuning.held_out import HeldOut
 from piezojax.tuning.make_result import _perturbed

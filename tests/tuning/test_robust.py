@@ -14,11 +14,11 @@ import tomli_w
 import piezojax as pj
 from piezojax.analysis.constraints import (
     CONSTRAINTS,
-    LoopFigures,
     constraint_count,
     violations,
     worst_excess,
 )
+from piezojax.analysis.loop_figures import LoopFigures
 from piezojax.analysis.stability import OperatingPoint, stability_report
 from piezojax.analysis.stability.sampled_margins import BANDS
 from piezojax.analysis.step_response import StepFigures
