@@ -1,14 +1,18 @@
 """``piezojax.excite``: voltages within the limits of a generator, and their content."""
 
+import io
+
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from page_reader import checked
+from rich.console import Console
 
 from piezojax.cli.excite import main
 from piezojax.identification.records.sampled import read_sampled
+from piezojax.report.excitation_pictures import excitation_page, next_record_page
 from piezojax.signals.excitation import (
     SMALL,
     Generator,
@@ -18,6 +22,7 @@ from piezojax.signals.excitation import (
     ladder,
     multisine,
 )
+from piezojax.tuning.next_record import ExpectedParameter, RecordReport
 
 GENERATOR = Generator(-20.0, 120.0, 10_000.0)
 
@@ -185,6 +190,30 @@ def test_the_command_writes_a_record_that_reads_back(tmp_path):
     page = checked(tmp_path / "out" / "report.html")
     assert "multisine" in page.cells
     assert "creep, up to 0.1 s" in page.cells
+
+
+def test_no_table_is_cut_at_80_columns():
+    console = Console(width=80, record=True, file=io.StringIO())
+    parts, _ = excitation(GENERATOR)
+    paths = "hysteresis.polynomial.0", "hysteresis.polynomial.1"
+    errors = {"value": -1.3983e-05, "unit": "um/V^(i+1)", "designed": 2.9e-06}
+    report = RecordReport(
+        noise_rms_um=0.003,
+        designed_s=1.0,
+        usual_s=2.0,
+        figures=[],
+        parameters=[
+            ExpectedParameter(path=path, **errors, first=1.6e-4, usual=8.6e-06)
+            for path in paths
+        ],
+    )
+    for page in (excitation_page(parts, {}), next_record_page(report, parts[0], {})):
+        for part in page.parts:
+            console.print(part, soft_wrap=isinstance(part, str))
+    printed = console.export_text()
+    assert "highest, V" in printed
+    assert "identifies" in printed
+    assert "…" not in printed
 
 
 def test_the_command_writes_the_parts_for_a_buffer(tmp_path):

@@ -21,7 +21,7 @@ def excitation_page(parts: Sequence[Part], files: Mapping[str, Part]) -> Page:
         "the stage must not reach its mechanical limits: on a new stage, begin with a "
         "small part of the range",
     ]
-    tables = [excitation_table(parts)]
+    tables = [excitation_table(parts), uses_table(parts)]
     return Page("voltages to record", (), [*tables, *_how_to_record(files), *notes])
 
 
@@ -34,7 +34,10 @@ def next_record_page(
         f"{1e3 * report.noise_rms_um:.3g} nm rms; what the model leaves out comes on "
         "top: judge the new model on another record (python -m piezojax.validate)",
     ]
-    tables = [figures_table(report), parameters_table(report), excitation_table([part])]
+    tables = [
+        *(figures_table(report), parameters_table(report)),
+        *(excitation_table([part]), uses_table([part])),
+    ]
     return Page("the next record", (), [*tables, *_how_to_record(files), *notes])
 
 
@@ -60,7 +63,7 @@ def figures_table(report: RecordReport) -> Table:
 def parameters_table(report: RecordReport) -> Table:
     """Return the parameters of the plant, with their errors after three records."""
     table = Table(title="standard errors of the parameters of the plant")
-    table.add_column("parameter")
+    table.add_column("parameter", overflow="fold")
     for name in ("value", "unit", "first fit", "designed", "usual"):
         table.add_column(name, justify="left" if name == "unit" else "right")
     for each in report.parameters:
@@ -90,12 +93,11 @@ def _how_to_record(files: Mapping[str, Part]) -> list[str]:
 
 
 def excitation_table(parts: Iterable[Part]) -> Table:
-    """Return a table of the parts: length, range, slew rate and use of each."""
+    """Return a table of the parts: length, range and slew rate of each."""
     table = Table(title="parts of the record")
-    table.add_column("part")
+    table.add_column("part", no_wrap=True)
     for name in ("samples", "rate, Hz", "s", "lowest, V", "highest, V", "slew, V/s"):
         table.add_column(name, justify="right")
-    table.add_column("identifies")
     for part in parts:
         count = part.voltages.size
         table.add_row(
@@ -106,8 +108,17 @@ def excitation_table(parts: Iterable[Part]) -> Table:
             f"{part.voltages.min():.4g}",
             f"{part.voltages.max():.4g}",
             f"{part.steepest:.3g}",
-            part.tells,
         )
+    return table
+
+
+def uses_table(parts: Iterable[Part]) -> Table:
+    """Return a table of what each of ``parts`` identifies."""
+    table = Table(title="use of the parts")
+    table.add_column("part", no_wrap=True)
+    table.add_column("identifies", overflow="fold")
+    for part in parts:
+        table.add_row(part.name, part.tells)
     return table
 
 
