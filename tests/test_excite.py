@@ -212,6 +212,7 @@ def test_no_table_is_cut_at_80_columns():
             console.print(part, soft_wrap=isinstance(part, str))
     printed = console.export_text()
     assert "highest, V" in printed
+    assert "a tracking error listed above is that of one run" in printed
     assert "identifies" in printed
     assert "…" not in printed
 

@@ -30,9 +30,11 @@ def next_record_page(
 ) -> Page:
     """Return the Page of a designed record: what it will tell, and how to record it."""
     notes = [
-        f"the errors are for a plant of the class of the model and white noise of "
-        f"{1e3 * report.noise_rms_um:.3g} nm rms; what the model leaves out comes on "
-        "top: judge the new model on another record (python -m piezojax.validate)",
+        "a tracking error listed above is that of one run on the plant; the promised "
+        "one is that of the worst run",
+        "the standard errors are for a plant of the class of the model and white noise "
+        f"of {1e3 * report.noise_rms_um:.3g} nm rms; what the model leaves out comes "
+        "on top: judge the new model on another record (python -m piezojax.validate)",
     ]
     tables = [
         *(figures_table(report), parameters_table(report)),
@@ -42,14 +44,14 @@ def next_record_page(
 
 
 def figures_table(report: RecordReport) -> Table:
-    """Return the promised figures, with their errors after two records."""
+    """Return the figures on the plant, with their errors after two records."""
     table = Table(
         title="standard errors of the promised figures",
         caption=f"designed: {report.designed_s:.3g} s; usual: ladder, holds and "
         f"multisine, {report.usual_s:.3g} s",
     )
     table.add_column("figure")
-    for name in ("promised", "designed, %", "usual, %"):
+    for name in ("in one run", "designed, %", "usual, %"):
         table.add_column(name, justify="right")
     for each in report.figures:
         table.add_row(
