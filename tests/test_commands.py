@@ -217,6 +217,7 @@ def test_validate_writes_a_checked_model(tmp_path):
     found = json.loads((out / "validation.json").read_text(encoding="utf-8"))
     (check,) = found["records"]
     assert check["zero"] == pytest.approx([4.0], abs=0.01)
+    assert f"{check['zero'][0]:.3g} um" in checked(out / "report.html").cells
     assert found["alarms"] == []
 
 

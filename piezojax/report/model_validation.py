@@ -103,7 +103,7 @@ def validation_table(report: ValidationReport) -> Table:
             check.record,
             *_errors(check),
             "-" if check.times_fit is None else f"{check.times_fit:.2f}",
-            ", ".join(f"{zero:.3g}" for zero in check.zero),
+            ", ".join(f"{zero:.3g} {check.unit}" for zero in check.zero),
             f"{check.judged[0] / check.rate_Hz:.3g} s",
         )
     return table
