@@ -390,6 +390,7 @@ def test_a_plant_from_a_response_is_assumed_to_lack_hysteresis(tmp_path, monkeyp
         (note,) = _hysteresis_notes(case)
         assert "a loop whose width is 15 % of its height" in note
         assert "limits on margins are also checked at its largest gain" in note
+        assert "steps are simulated without it" in note
         assert make_data(case).tuning.disturbance is not None
     off = study_of(plant=table, disturbance={"hysteresis": 0.0})
     case = build(off, tmp_path / "study.toml")

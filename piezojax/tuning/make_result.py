@@ -224,7 +224,8 @@ def _hysteresis_notes(case: Case) -> list[str]:
             f"whose width is {100.0 * width:.3g} % of its height over the references "
             "(disturbance.hysteresis): its deviation from the plant disturbs half of "
             "the runs, and the errors hold for stages with no wider loop; limits on "
-            f"margins {checked} checked at its largest gain"
+            f"margins {checked} checked at its largest gain; steps are simulated "
+            "without it, and the stage may overshoot more"
         ]
     if case.plant_about.small_motions:
         return [
