@@ -734,6 +734,8 @@ def test_a_start_from_a_response_tunes_and_exports(run, response, tmp_path):
     assert status == 0, output
     assert calls == [("tune", "tuned"), ("export", "tuned", "c")]
     assert f"read {response}: 200 lines from 1 to 2000 Hz" in output
+    gain = abs(mode_response().values[0])
+    assert f"with a gain of {gain:.4g} um/V at the lowest" in output
     plant = load(tmp_path / "out" / "study.toml").plant
     assert plant == {"response": "../bench.csv"}
     for again in (options, ("--response",), ()):

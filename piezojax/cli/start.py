@@ -180,7 +180,8 @@ def _response(response: Path, folder: Path, given: dict[str, Any]) -> Measuremen
         plant_of_response(response, folder, unit=given["unit"], held=given["held"]),
         rate,
         f"read {response}: {loaded.frequency.size} lines from "
-        f"{loaded.frequency[0]:.4g} to {loaded.frequency[-1]:.4g} Hz",
+        f"{loaded.frequency[0]:.4g} to {loaded.frequency[-1]:.4g} Hz, with a gain of "
+        f"{abs(loaded.values[0]):.4g} um/V at the lowest",
         partial(Shown.by_response, loaded, 1.0 / rate),
         UNSHOWN,
     )
