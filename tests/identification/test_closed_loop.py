@@ -196,6 +196,22 @@ def test_strongly_coloured_noise_becomes_white():
     assert np.all(whitening_filter([noise[:30]])[1:] == 0.0)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_rounded_multisine_is_not_made_by_feedback(seed):
+    # Its 60 lines need 120 past samples; 9 digits of them are saved.
+    random, time = np.random.default_rng(seed), 1e-4 * np.arange(4000)
+    phases = random.uniform(0.0, 2.0 * np.pi, 60)
+    turns = np.outer(time, np.geomspace(20.0, 4000.0, 60))
+    lines = np.sin(2.0 * np.pi * turns + phases).sum(axis=1)
+    voltage = np.round(50.0 + 0.5 * lines / np.abs(lines).max(), 7)
+    w = 2.0 * np.pi * 780.0
+    mode = [0.4 * w**2], [1.0, 0.04 * w, w**2]
+    b, a, _ = scipy.signal.cont2discrete(mode, 1e-4)
+    moved = scipy.signal.lfilter(b[0], a, voltage - voltage[0])
+    moved += 2e-3 * random.standard_normal(time.size)
+    assert feedback_share(voltage, moved) == 0.0
+
+
 def test_feedback_is_seen():
     record, noise = loop("fast PID", 2000, 2, reference=0.1)
     assert feedback_share(record.input, record.output) > SHARE

@@ -29,6 +29,11 @@ PREDICTABLE = 1e-10
 """Power of the prediction error, as a share of the power of the input, below which an
 input counts as predictable from its own past."""
 
+LONGER = 2 * OWN
+"""Number of past samples of the input that may show that it is predictable. OWN samples
+do not determine a multisine of more than OWN / 2 lines, and the output, which contains
+information on older inputs, explains part of the error without feedback."""
+
 
 def feedback_share(input: np.ndarray, output: np.ndarray) -> float:
     """Return the share of the input's prediction error that past outputs explain.
@@ -41,7 +46,8 @@ def feedback_share(input: np.ndarray, output: np.ndarray) -> float:
     for start in range(0, min(input.size, MOST * STRETCH) - STRETCH + 1, STRETCH):
         part = slice(start, start + STRETCH)
         own, both, rows = _left(input[part], output[part])
-        if own <= PREDICTABLE * np.var(input[part]) * rows:
+        least = PREDICTABLE * np.var(input[part])
+        if own <= least * rows or _longer_error(input[part]) <= least:
             continue
         # Each stretch counts relative to its own variance: none outweighs the others.
         likelihood += rows * np.log(own / max(both, np.finfo(float).tiny))
@@ -58,9 +64,20 @@ def _left(input: np.ndarray, output: np.ndarray) -> tuple[float, float, int]:
     too. y(k) is left out, because an input that acts within its sample changes it.
     """
     u, y = input - input.mean(), output - output.mean()
-    windows = np.lib.stride_tricks.sliding_window_view
-    own = windows(u[:-1], OWN)
-    columns = (own, np.ones(len(own)), windows(y[OWN - LAGS : -1], LAGS), u[OWN:])
+    own = _windows(u[:-1], OWN)
+    columns = (own, np.ones(len(own)), _windows(y[OWN - LAGS : -1], LAGS), u[OWN:])
     triangle = np.asarray(np.linalg.qr(np.column_stack(columns), mode="r"))
     rest = triangle[OWN + 1 :, -1]
     return float(rest @ rest), float(rest[-1] ** 2), len(own)
+
+
+def _longer_error(input: np.ndarray) -> float:
+    """Return the power of the error of a prediction from LONGER past samples."""
+    u = input - input.mean()
+    own = _windows(u[:-1], LONGER)
+    columns = np.column_stack((own, np.ones(len(own)), u[LONGER:]))
+    triangle = np.asarray(np.linalg.qr(columns, mode="r"))
+    return float(triangle[-1, -1] ** 2) / len(own)
+
+
+_windows = np.lib.stride_tricks.sliding_window_view
