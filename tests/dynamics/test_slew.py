@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import scipy.signal
+from oracles import excitation, forty_stages
 from oracles import hysteresis as oracle
 
 from piezojax import Record, simulate
@@ -82,6 +83,36 @@ def test_a_record_with_steps_shows_slew_rate_and_mode():
 
 def test_a_fast_amplifier_shows_no_slew_rate():
     assert dynamics_of(Record(STEPS, stage(STEPS, None), DT)).slew is None
+
+
+def chirp(amplitude, start=5.0, stop=4e3, samples=8000):
+    """Return slow cycles, then a logarithmic chirp (Hz) of ``amplitude`` in V."""
+    slow = 50.0 - 45.0 * np.cos(2.0 * np.pi * 6.0 * DT * np.arange(5000))
+    time, ratio = np.arange(samples) * DT, np.log(stop / start) / (samples * DT)
+    phase = 2.0 * np.pi * start * np.expm1(ratio * time) / ratio
+    ramp = np.linspace(slow[-1], 50.0, 200)
+    return np.concatenate([slow, ramp, 50.0 + amplitude * np.sin(phase)])
+
+
+def test_a_chirp_that_is_too_fast_for_the_amplifier_shows_its_slew_rate():
+    u = chirp(2.0)
+    found = dynamics_of(Record(u, stage(u, 3e3), DT))
+    assert found.slew == pytest.approx(3e3, rel=0.1)
+    assert dynamics_parts(Record(u, stage(u, 3e3), DT)).endswith("+slew")
+
+
+def test_a_chirp_that_the_amplifier_follows_shows_no_slew_rate():
+    for amplitude, rate in ((2.0, None), (0.05, 3e3)):
+        u = chirp(amplitude)
+        assert dynamics_of(Record(u, stage(u, rate), DT)).slew is None
+
+
+def test_modes_that_the_simple_model_lacks_are_no_slew_rate():
+    # Its error falls to 0.7 of itself with a slew rate; that of the full model rises.
+    other = forty_stages.stage(15)
+    voltages, readings = excitation.record(other)
+    half = voltages.size // 2
+    assert dynamics_of(Record(voltages[:half], readings[:half], other.dt)).slew is None
 
 
 SINE = 50.0 + 30.0 * np.sin(2.0 * np.pi * 20.0 * DT * np.arange(2000))

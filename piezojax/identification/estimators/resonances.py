@@ -21,7 +21,7 @@ from .hammerstein import (
     with_lag,
 )
 from .refined import refined_instrumental_variables
-from .slew_rate import slew_rate, slewed
+from .slew_rate import CLEAR, has_steps, slew_rate, slewed
 
 SHORTEST = 400
 """Least number of samples from which dynamics are identified."""
@@ -98,12 +98,28 @@ def _found_once(input: bytes, output: bytes, dt: float) -> _Found:
     if x.size < SHORTEST:
         return LinearDynamics(), None
     moved = _above_slowest(y)
-    # The plays take long, and steps show the rate without them.
+    # The plays take long, and fast motions show the rate without them.
     rate = slew_rate(x, lambda slewed: _simple_cost(slewed, moved))
-    x = x if rate is None else slewed(x, rate)
-    slopes = 1.0 - 2.0 * np.array(THRESHOLDS)
-    found, model = _shown(Signals(_play_outputs(x), slopes, moved), dt)
+    found, model = _behind(x if rate is None else slewed(x, rate), moved, dt)
+    if rate is not None and not has_steps(x):
+        # Further modes and lags may explain as much as the slew rate does. A record
+        # without a resonance does not tell it from a hysteresis.
+        plain, without = _behind(x, moved, dt)
+        if not plain.modes or not _clearly_better(model, without):
+            return plain, without
     return found._replace(slew=None if rate is None else rate / dt), model
+
+
+def _behind(x: np.ndarray, moved: np.ndarray, dt: float) -> _Found:
+    """Return what ``x``, behind the amplifier, and the output ``moved`` show."""
+    slopes = 1.0 - 2.0 * np.array(THRESHOLDS)
+    return _shown(Signals(_play_outputs(x), slopes, moved), dt)
+
+
+def _clearly_better(model: Hammerstein | None, without: Hammerstein | None) -> bool:
+    if model is None or without is None:
+        return False
+    return white_error(model) < CLEAR * white_error(without)
 
 
 def _simple_cost(x: np.ndarray, moved: np.ndarray) -> float:
@@ -126,6 +142,8 @@ def slew_behind(
     ``front_of`` is the fitted hysteresis behind the amplifier, from its input to its
     output [samples].
     """
+    if not has_steps(input):
+        return None
     moved = _above_slowest(output)
     rate = slew_rate(input, lambda slewed: _simple_cost(front_of(slewed), moved))
     return None if rate is None else rate / dt
