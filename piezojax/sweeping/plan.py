@@ -1,8 +1,9 @@
 """Plan of a sweep: its points and their division into chunks."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from typing import NamedTuple
 
 import jax
@@ -10,6 +11,7 @@ import numpy as np
 
 from ..core.arrays import as_array
 from ..core.paths import declared, get
+from ..core.paths import replace as replace_values
 from ..core.rollout import BLOCK
 from ..core.space import Range, space_of
 from ..core.system import System
@@ -212,23 +214,48 @@ def _samples(table: SweepTable, axes: Sequence[Axis], seed: int) -> np.ndarray:
 
 
 def _check_paths(case: Case, axes: Sequence[Axis]) -> None:
-    """Raise ValueError for an unknown path or a bound that one of the loops refuses."""
+    """Raise ValueError for an unknown path or bounds that one of the loops refuses."""
     for name, plant in plants_of(case).items():
+        parts = {
+            "controller": case.loop.controller,
+            "plant": plant,
+            "actuator": case.loop.actuator,
+            "sensor": case.loop.sensor,
+        }
+        swept: dict[str, dict[str, Axis]] = {part: {} for part in parts}
+
+        def where(axis: Axis, name: str = name) -> str:
+            of_plant = axis.path.startswith("plant.") and case.plants
+            return f"sweep.parameters.{axis.path}" + (
+                f", plant {name}" if of_plant else ""
+            )
+
         for axis in axes:
-            part = axis.path.split(".")[0]
-            parts = {
-                "controller": case.loop.controller,
-                "plant": plant,
-                "actuator": case.loop.actuator,
-                "sensor": case.loop.sensor,
-            }
-            inner = axis.path.removeprefix(f"{part}.")
-            where = f"sweep.parameters.{axis.path}"
-            if part == "plant" and case.plants:
-                where = f"{where}, plant {name}"
+            part, _, inner = axis.path.partition(".")
             try:
                 get(parts[part], inner)
             except ValueError as error:
-                raise ValueError(f"{where}: {error}") from None
+                raise ValueError(f"{where(axis)}: {error}") from None
             for value in (axis.range.lower, axis.range.upper):
-                check_value(parts[part], inner, value, where)
+                check_value(parts[part], inner, value, where(axis))
+            swept[part][inner] = axis
+        for part, together in swept.items():
+            if len(together) > 1:
+                _check_together(parts[part], together, where)
+
+
+def _check_together(
+    part: System, axes: Mapping[str, Axis], where: Callable[[Axis], str]
+) -> None:
+    """Raise ValueError if ``part`` refuses two bounds at once, such as crossed limits.
+
+    ``axes`` are the swept parameters by their path in ``part``. Each is at one end
+    while all others are at either end, so that every pair of bounds is tried.
+    """
+    lower, upper = (
+        {inner: getattr(axis.range, end) for inner, axis in axes.items()}
+        for end in ("lower", "upper")
+    )
+    for own, others in product((lower, upper), repeat=2):
+        for inner, axis in axes.items():
+            check_value(replace_values(part, others), inner, own[inner], where(axis))

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+from contextlib import nullcontext
 
 import jax
 import numpy as np
@@ -175,6 +176,27 @@ def test_bad_tables_are_refused_in_one_line(case_of, path, value, message):
     with pytest.raises(ValueError, match=message) as caught:
         Plan(case_of(changed(path, value)))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "refused"),
+    [
+        ([-20.0, 100.0], [50.0, 120.0], True),
+        ([-20.0, 40.0], [50.0, 120.0], False),
+    ],
+)
+def test_limits_that_cross_at_a_point_are_refused(case_of, lower, upper, refused):
+    case = case_of(
+        {
+            "parameters": {
+                "actuator.limits.lower": {"values": lower},
+                "actuator.limits.upper": {"values": upper},
+            }
+        }
+    )
+    message = r"sweep.parameters.actuator.limits.\w+: lower is 100 and upper is 50; "
+    with pytest.raises(ValueError, match=message) if refused else nullcontext():
+        Plan(case)
 
 
 @pytest.mark.parametrize(
