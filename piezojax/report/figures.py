@@ -1,7 +1,7 @@
 """Style of all pictures, and writing of a picture to a file."""
 
 import io
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from textwrap import fill
@@ -49,6 +49,11 @@ def figure(width: float, height: float) -> Figure:
     It is made without pyplot, which would keep global state and choose a backend.
     """
     return Figure(figsize=(width, height), layout="constrained")
+
+
+def small_units(units: Iterable[str]) -> str:
+    """Return the units of small errors, "nm or nrad"; "nm" if there are no units."""
+    return " or ".join(dict.fromkeys(UNITS[unit][1] for unit in units)) or "nm"
 
 
 def plain_number(value: float) -> str:

@@ -1,6 +1,6 @@
 """Tables and pictures of constraints, perturbed plants and Pareto fronts."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ from rich.table import Table
 from ..analysis.constraints import CONSTRAINTS
 from ..solve.problem import FAILED_LOSS
 from ..tuning.result import FrontPoint, Perturbed, Result
-from .figures import AFTER, BEFORE, add_title, figure, plain_tick_labels
+from .figures import AFTER, BEFORE, add_title, figure, plain_tick_labels, small_units
 
 
 def constraints_table(result: Result) -> Table:
@@ -37,10 +37,13 @@ def constraints_table(result: Result) -> Table:
     return table
 
 
-def front_table(front: Sequence[FrontPoint], constraint: str) -> Table:
-    """Return the table of the points of a Pareto front."""
+def front_table(
+    front: Sequence[FrontPoint], constraint: str, units: Iterable[str]
+) -> Table:
+    """Return the table of the points of a Pareto front; ``units`` are those of axes."""
+    shown = f"error, {small_units(units)}"
     table = Table(title="Pareto front")
-    for name in (f"{constraint} limit", "reached", "error, nm", "objective"):
+    for name in (f"{constraint} limit", "reached", shown, "objective"):
         table.add_column(name, justify="right", no_wrap=True)
     for point in front:
         error, failed = point.geomean_rms_um, point.loss >= FAILED_LOSS
@@ -53,8 +56,13 @@ def front_table(front: Sequence[FrontPoint], constraint: str) -> Table:
     return table
 
 
-def perturbed_figure(perturbed: Perturbed | None, title: str) -> Figure | None:
-    """Draw the distributions of errors and constrained figures on held-out plants."""
+def perturbed_figure(
+    perturbed: Perturbed | None, title: str, units: Iterable[str]
+) -> Figure | None:
+    """Draw the distributions of errors and constrained figures on held-out plants.
+
+    ``units`` are those of the axes.
+    """
     if perturbed is None or not perturbed.geomeans_um:
         return None
     limited = list(perturbed.values)
@@ -71,7 +79,8 @@ def perturbed_figure(perturbed: Perturbed | None, title: str) -> Figure | None:
         _distribution(panel, errors, perturbed.plants, color=colour, label=label)
     panel.set_xscale("log")
     plain_tick_labels(panel.xaxis)
-    panel.set_xlabel("rms error, geometric mean over references, nm")
+    unit = small_units(units)
+    panel.set_xlabel(f"rms error, geometric mean over references, {unit}")
     panel.set_ylabel(f"share of {perturbed.plants} held-out plants, %")
     panel.legend()
     for panel, name in zip(panels[1:], limited, strict=True):
@@ -94,9 +103,15 @@ def _distribution(panel: Any, values: Sequence[float], of: int, **style: Any) ->
 
 
 def front_figure(
-    front: Sequence[FrontPoint] | None, constraint: str | None, title: str
+    front: Sequence[FrontPoint] | None,
+    constraint: str | None,
+    title: str,
+    units: Iterable[str],
 ) -> Figure | None:
-    """Draw the error against the constrained figure along a Pareto front."""
+    """Draw the error against the constrained figure along a Pareto front.
+
+    ``units`` are those of the axes.
+    """
     if not front or constraint is None:
         return None
     drawn = [
@@ -114,7 +129,9 @@ def front_figure(
             colour = AFTER if kept else BEFORE
             panel.plot(*zip(*points, strict=True), style, color=colour, label=label)
     panel.set_xlabel(f"{_constraint_label(constraint)} on the worst plant tuned on")
-    panel.set_ylabel("rms error on the nominal plant,\ngeometric mean, nm")
+    panel.set_ylabel(
+        f"rms error on the nominal plant,\ngeometric mean, {small_units(units)}"
+    )
     panel.legend()
     add_title(picture, title)
     return picture

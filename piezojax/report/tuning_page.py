@@ -35,7 +35,7 @@ def tuning_page(outcome: Outcome, surrogate: GainSurrogate | str | None = None) 
     result, study = outcome.result, outcome.case.study
     stability, baselines = outcome.stability, outcome.baselines
     front = (
-        front_table(result.front, study.pareto.constraint)
+        front_table(result.front, study.pareto.constraint, result.units.values())
         if result.front and study.pareto
         else None
     )

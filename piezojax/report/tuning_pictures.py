@@ -63,11 +63,14 @@ def write_results(outcome: Outcome, folder: Path) -> Pictures:
             if outcome.steps[1]
             else None,
             "structures.png": structures_figure(result.structures, result.heading),
-            "robustness.png": perturbed_figure(result.perturbed, result.heading),
+            "robustness.png": perturbed_figure(
+                result.perturbed, result.heading, result.units.values()
+            ),
             "pareto.png": front_figure(
                 result.front,
                 study.pareto.constraint if study.pareto else None,
                 result.heading,
+                result.units.values(),
             ),
         }
         for name, picture in pictures.items():

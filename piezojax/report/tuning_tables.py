@@ -10,6 +10,7 @@ from rich.text import Text
 from ..analysis.stability import StabilityReport, StabilityReports, worst_margins
 from ..analysis.stability.measured_margins import MeasuredMargins
 from ..tuning.result import Perturbed, Result, Scores
+from .figures import small_units
 
 
 def _nanometres(value: float | None) -> str:
@@ -22,7 +23,7 @@ def _ratio(before: float | None, after: float | None) -> str:
 
 def tuning_table(result: Result) -> Table:
     """Return a table of rms errors on held-out noise, before and after tuning."""
-    unit = " or ".join(dict.fromkeys(_SMALL[u] for u in result.units.values())) or "nm"
+    unit = small_units(result.units.values())
     table = Table(
         title=Text(f"{result.heading}\nrms tracking error on held-out noise, {unit}")
     )
@@ -63,16 +64,16 @@ def tuning_table(result: Result) -> Table:
     return table
 
 
-_SMALL = {"um": "nm", "urad": "nrad"}
-"""Units a thousand times smaller, in which errors are shown."""
-
 _MOST_ROWS = 12  # above it, axes at rest have only their geometric mean
 
 
 def beside_table(result: Result) -> Table:
-    """Return the table of held-out errors (nm) of the tuned and other controllers."""
+    """Return the table of held-out errors of the tuned and other controllers."""
     plants = result.beside["tuned"].plants
-    title = "rms tracking error on the hold-out, nm: geometric mean over all references"
+    title = (
+        f"rms tracking error on the hold-out, {small_units(result.units.values())}: "
+        "geometric mean over all references"
+    )
     if plants:
         title += f"\n(median and worst of {plants} held-out perturbed plants)"
     table = Table(title=Text(title))

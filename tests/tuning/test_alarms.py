@@ -442,7 +442,8 @@ def test_margins_that_nothing_limits_are_unlimited_in_every_text():
         ),
         "sensitivity_peak 1.25 on the worst of 3 held-out plants",
     ]
-    _, *panels = perturbed_figure(drawn, "").axes
+    first, *panels = perturbed_figure(drawn, "", ("um", "urad")).axes
+    assert first.get_xlabel().endswith("over references, nm or nrad")
     for panel, lost in zip(panels, (2, 3, 3, 0), strict=True):
         curve = panel.lines[0]
         assert len(curve.get_xdata()) == 3 - lost

@@ -156,6 +156,8 @@ def test_a_tuned_study_saves_and_prints_the_figures(tmp_path):
     assert json.loads(result.model_dump_json())["beside"]["tuned"]
     (names,) = (list(c.cells) for c in beside_table(result).columns[:1])
     assert names == list(result.beside)
+    turned = result.model_copy(update={"units": {"Rx": "urad"}})
+    assert "on the hold-out, nrad: " in str(beside_table(turned).title)
 
 
 def test_gains_of_an_earlier_run_are_read_from_their_file(tmp_path):

@@ -17,13 +17,25 @@ def point(error, loss):
 
 
 def test_a_point_that_diverges_is_named_and_not_drawn():
-    table = front_table([point(0.5, -1.0), point(None, 1e6)], "sensitivity_peak")
+    table = front_table(
+        [point(0.5, -1.0), point(None, 1e6)], "sensitivity_peak", ("um",)
+    )
     _, _, errors, losses = (list(column.cells) for column in table.columns)
     assert errors == ["500.00", "diverges"]
     assert losses == ["-1.000", "failed"]
-    drawn = front_figure([point(0.5, -1.0), point(None, 1e6)], "sensitivity_peak", "")
+    drawn = front_figure(
+        [point(0.5, -1.0), point(None, 1e6)], "sensitivity_peak", "", ("um",)
+    )
     assert [len(line.get_xdata()) for line in drawn.axes[0].lines] == [1]
-    assert front_figure([point(None, 1e6)], "sensitivity_peak", "") is None
+    assert front_figure([point(None, 1e6)], "sensitivity_peak", "", ("um",)) is None
+
+
+def test_errors_of_a_stage_with_rotations_have_both_units():
+    front, units = [point(0.5, -1.0)], ("um", "urad", "um")
+    table = front_table(front, "sensitivity_peak", units)
+    assert table.columns[2].header == "error, nm or nrad"
+    (panel,) = front_figure(front, "sensitivity_peak", "", units).axes
+    assert panel.get_ylabel().endswith("geometric mean, nm or nrad")
 
 
 def place(limit, loss, kept=True, unit=0.0):
