@@ -15,9 +15,11 @@ def drive_table(
 
     ``rate`` is the sampling rate, Hz. Figures that need a capacitance are left out
     unless ``has_capacitance``. On a stage with several axes, V stands for the unit of
-    the commands.
+    the commands, as the caption says.
     """
     table = Table(title="voltage at the piezo on held-out noise, worst reference")
+    if len(drive[1]) > 1:
+        table.caption = "V stands for the unit of the command of each axis"
     table.add_column("figure")
     for title in ("before", "tuned", "unit"):
         table.add_column(title, justify="right", no_wrap=True)

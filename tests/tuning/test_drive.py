@@ -129,6 +129,7 @@ def test_the_figures_are_in_the_file_and_in_the_table(outcome, tmp_path):
     titles = list(table.columns[0].cells)
     assert titles[1] == "above 2000 Hz, rms"
     assert len(titles) == 7
+    assert table.caption is None
     noise = outcome.drive[1]["piezo"].noise_rms_V
     assert next(iter(table.columns[2].cells)) == f"{noise:.3g}"
 
@@ -143,6 +144,7 @@ def test_figures_that_need_a_capacitance_are_omitted_without_one():
     ]
     shown = list(table.columns[1].cells)[:4]
     assert shown == ["0.1", "diverges", "2", "diverges"]
+    assert "V stands for the unit of the command" in str(table.caption)
 
 
 def test_currents_of_diverged_loops_are_in_the_table():
