@@ -10,6 +10,7 @@ import piezojax as pj
 from piezojax.study import Study, build
 from piezojax.study.file_tables import NoiseFile
 from piezojax.study.measured_noise import confidence, read_noise
+from piezojax.study.study_file import as_toml, load
 from piezojax.study.tables import validated
 from piezojax.tuning.data import make_data
 
@@ -263,3 +264,13 @@ def test_a_bad_table_is_refused(tables, message):
     with pytest.raises(ValueError, match=message) as caught:
         validated(Study, copy.deepcopy(STUDY) | tables, "")
     assert "\n" not in str(caught.value)
+
+
+def test_the_study_of_a_case_is_read_back(folder):
+    study = study_of(sensor={"measured_noise": {"file": "noise.npz"}})
+    case = build(study, folder / "study.toml")
+    assert case.study.sensor.noise_rms > 0.0
+    written = folder / "written.toml"
+    written.write_text(as_toml(case.study), encoding="utf-8")
+    assert load(written) == study
+    assert pj.study.read(written).sha256 == case.sha256

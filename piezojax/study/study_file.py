@@ -42,9 +42,13 @@ _FILES = _file_keys(Study | RecordPlant | ResponsePlant)
 def as_toml(study: Study, renamed: Callable[[str], str] = str) -> str:
     """Return the text of ``study`` as a file, with every default written out.
 
+    The rms of a measured noise is left out: a Case computes it from the file. Therefore
+    the study of a Case and the one from which it was built have the same text.
     ``renamed`` maps the names of files to those in the text.
     """
     content = study.model_dump(mode="json", exclude_none=True)
+    if study.sensor.measured_noise is not None:
+        del content["sensor"]["noise_rms"]
     return tomli_w.dumps(_with_files(content, renamed))
 
 
