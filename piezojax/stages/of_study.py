@@ -9,6 +9,7 @@ from ..core.serial import load
 from ..core.system import Affine, System
 from ..dynamics import FractionalDelay
 from ..study import Case, Study, read
+from ..study.case import with_measured_noise
 from ..study.make_hardware import driven
 from ..study.references import reference_signals
 from ..study.trajectories import read_trajectories
@@ -75,9 +76,10 @@ def motions_of(
     """Return the references of ``study`` with their ``promised`` errors (um).
 
     Only those named in ``promised`` are returned. The files that the study names lie in
-    ``folder``. Raises ValueError for several axes and a reference file that is missing.
+    ``folder``. Raises ValueError for several axes and for a file that is missing.
     """
     _check_axes(study)
+    study, _ = with_measured_noise(study, folder)
     table = study.references
     signals = reference_signals(study, read_trajectories(study, folder))
     noise = study.by_axis(study.sensor.noise_rms)[0]

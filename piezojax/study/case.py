@@ -172,7 +172,7 @@ def build(
         study = study.model_copy(update={"seed": seed})
     contents = contents_of(study, path.parent)  # before a file can change
     trajectories = read_trajectories(study, path.parent)
-    study, measured = _with_measured_noise(study, path.parent)
+    study, measured = with_measured_noise(study, path.parent)
     plant, about, fit, response, notes_of_plant = _plant(
         study, path.parent, progress or Silent()
     )
@@ -247,7 +247,7 @@ def read(path: str | Path, seed: int | None = None) -> Case:
     return build(load(path), path, seed)
 
 
-def _with_measured_noise(
+def with_measured_noise(
     study: Study, folder: Path
 ) -> tuple[Study, dict[str, MeasuredNoise]]:
     """Return ``study`` with the rms noise of its sensor, and the measured noise.

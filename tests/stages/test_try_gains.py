@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from stages.stage_in_tests import DT, REFERENCE, SAFE, lag, stage
+from stages.stage_in_tests import DT, REFERENCE, SAFE, lag, stage, write_study
 
 from piezojax.stages import (
     Fault,
@@ -16,8 +16,10 @@ from piezojax.stages import (
     TrialReport,
     trial,
 )
+from piezojax.stages.of_study import motions_of
 from piezojax.stages.run_files import run_file, run_files, save_samples
 from piezojax.stages.try_gains import TRIAL_FILE
+from piezojax.study import load
 
 GAINS = {"proportional": 1.0, "integral": 900.0}
 START = 500
@@ -81,6 +83,15 @@ def test_a_motion_without_a_promise_is_refused(tmp_path):
     with pytest.raises(ValueError, match="SIN1 has no promised error"):
         trial(stage(), GAINS, unknown, tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_the_noise_of_a_motion_may_be_measured(tmp_path):
+    drawn = 5e-3 * np.random.default_rng(0).standard_normal(4000)
+    np.savez(tmp_path / "noise.npz", z_um=drawn, fs=1.0 / DT)
+    sensor = {"measured_noise": {"file": "noise.npz"}}
+    study = load(write_study(tmp_path, sensor=sensor))
+    (motion,) = motions_of(study, tmp_path, {"SIN2": 0.01})
+    assert motion.noise == pytest.approx(5e-3, rel=0.1)
 
 
 def test_runs_are_read_in_the_order_of_their_numbers(tmp_path):
