@@ -28,6 +28,9 @@ NOTHING_TO_TUNE = "tune and parameters are missing; name at least one parameter 
 _OWN_LISTS = ("tune", "unseen", "files")
 """Keys whose lists are not values by axis."""
 
+_OWN_LOOPS = ("before", "tuned")
+"""Names in a result of the loops with the start and with the tuned gains."""
+
 MEMORY_GB = 4.0
 """Largest memory of the signals of a study, GB. Tuning takes several times as much."""
 
@@ -97,6 +100,16 @@ class Study(Table):
     @classmethod
     def _quoted(cls, tables: Any) -> Any:
         return require_quoted_paths(tables)
+
+    @field_validator("beside")
+    @classmethod
+    def _named(cls, tables: dict[str, BesideTable]) -> dict[str, BesideTable]:
+        for name in _OWN_LOOPS:
+            if name in tables:
+                raise ValueError(
+                    f"{name} is the name of a loop of the study itself; choose another"
+                )
+        return tables
 
     @model_validator(mode="after")
     def _tuned(self) -> "Study":

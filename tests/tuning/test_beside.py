@@ -198,3 +198,9 @@ PID_OF_CATALOG = {"controller": {"catalog": "p753_pid"}}
 def test_bad_controllers_beside_are_refused(tmp_path, beside, message):
     with pytest.raises(ValueError, match=message):
         read(written(tmp_path, beside={"x": beside}))
+
+
+@pytest.mark.parametrize("name", ["before", "tuned"])
+def test_names_of_the_own_loops_are_refused(tmp_path, name):
+    with pytest.raises(ValueError, match=f"beside: {name} is the name of a loop of"):
+        read(written(tmp_path, beside={name: PID_OF_CATALOG}))
