@@ -383,6 +383,10 @@ def test_a_limit_of_rounding_size_is_reported_as_zero():
     assert limit_text(report).startswith("limit of linear control: zero up to rounding")
 
 
+def test_the_ratio_to_a_limit_of_zero_is_infinite():
+    assert comparison(4.0, 0.0, None).ratio == np.inf
+
+
 def test_the_text_states_the_reason_for_no_limit(tmp_path):
     write_limit("the stage sleeps", tmp_path)
     data = json.loads((tmp_path / "limit.json").read_text(encoding="utf-8"))

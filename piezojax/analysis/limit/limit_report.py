@@ -49,8 +49,8 @@ class LimitComparison:
 
     @property
     def ratio(self) -> float:
-        """Ratio of the loop's error to the limit."""
-        return self.tuned / self.limit
+        """Ratio of the loop's error to the limit; infinite if the limit is 0."""
+        return self.tuned / self.limit if self.limit > 0.0 else float("inf")
 
     @property
     def largest_excess(self) -> str | None:
