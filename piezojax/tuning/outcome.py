@@ -200,12 +200,12 @@ class Outcome:
     def step_runs(self) -> tuple[dict[str, StepRun], dict[str, StepRun]]:
         """Runs of the steps by their name, before and after tuning.
 
-        They are as long as the references, without noise and disturbance, and empty on
-        several axes.
+        They are as long as the references, without noise and disturbance. There are
+        none on several axes, and none if all references rest at one position.
         """
-        if self.case.study.axes is not None:
-            return {}, {}
         signals, dt = self.holdout, self.case.study.dt
+        if self.case.study.axes is not None or not np.ptp(signals.references):
+            return {}, {}
         samples = signals.references.shape[1]
         quiet = jax.tree.map(jnp.zeros_like, signals.run_noise.of(0, 0))
         ends = step_ends(np.asarray(signals.references))

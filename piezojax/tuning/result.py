@@ -254,7 +254,7 @@ class Result(BaseModel):
     drive: dict[str, Drive] = {}
     """The same figures of the tuned gains."""
     steps_before: dict[str, StepResult] = {}
-    """Step tests before tuning, by step; none on several axes."""
+    """Step tests before tuning, by step; none on several axes or at rest."""
     steps: dict[str, StepResult] = {}
     """The same steps with the tuned gains."""
     on_response: dict[str, MeasuredMargins] = {}

@@ -231,6 +231,9 @@ def test_noise_differs_between_references():
         one, other = part.per_reference_rms_um.values()
         assert one != other
         assert 0.5 < one / other < 2.0
+    # A stage that rests has no step, and so no overshoot.
+    assert found.result.steps == {}
+    assert found.result.alarms == []
 
 
 def test_history_contains_the_lowest_loss_of_each_start(outcome):
