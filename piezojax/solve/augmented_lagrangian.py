@@ -30,8 +30,19 @@ def penalty_terms(
     A penalty term is ``penalty``/2 max(0, g + multiplier/penalty)^2, with the violation
     g.
     """
-    shifted = violation + multipliers / penalty
-    return jnp.sqrt(0.5 * penalty) * jnp.maximum(shifted, 0.0)
+    return jnp.maximum(signed_terms(violation, multipliers, penalty), 0.0)
+
+
+def signed_terms(
+    violation: Float[Array, " constraints"],
+    multipliers: Float[Array, " constraints"],
+    penalty: Array,
+) -> Float[Array, " constraints"]:
+    """Return ``penalty_terms``, but below 0 for a constraint with slack.
+
+    Their derivatives tell a step which constraints it will meet.
+    """
+    return jnp.sqrt(0.5 * penalty) * (violation + multipliers / penalty)
 
 
 def update_multipliers(

@@ -51,6 +51,7 @@ PARALLEL = Damping(
     multiples=tuple(10.0 ** np.linspace(-1.8, 0.9, 4)),
     corrections=2,
     grow=30.0,
+    attempts=4,
     last=1e8,
 )
 """Rule for losses that cost as much at four points as at one, and for the unit box, in

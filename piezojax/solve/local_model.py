@@ -18,10 +18,30 @@ FLOOR = 1e-14
 """Least damping as a share of the largest curvature; it keeps the normal equations
 regular where a direction has no slope."""
 
+MEETINGS = 10
+"""Most steps tried to find the constraints that a step meets."""
+
 Box = tuple[float, float]
 """Lower and upper bound of every unknown."""
 
 UNIT_BOX, UNBOUNDED = (0.0, 1.0), (-np.inf, np.inf)
+
+
+class Slack(NamedTuple):
+    """Terms of constraints that hold at the point of a model: ``values`` below 0.
+
+    ``jacobian`` [n, terms] are their derivatives, ``places`` their indices among the
+    residuals of the model. Where a linearised term is above 0, half its square is part
+    of the loss.
+    """
+
+    values: np.ndarray
+    jacobian: np.ndarray
+    places: np.ndarray
+
+    def after(self, step: np.ndarray) -> np.ndarray:
+        """Return the linearised terms after ``step``."""
+        return self.values + step @ self.jacobian
 
 
 class LocalModel(NamedTuple):
@@ -30,7 +50,8 @@ class LocalModel(NamedTuple):
     ``gradient`` [n] and ``curvature`` [n, n] are those of the loss: J'r and J'J for
     half a sum of squares. ``metric`` [n] weights the damping of each unknown; 1 damps
     all equally. Corrections need ``jacobian`` [n, residuals], the derivatives of the
-    weighted residuals, and their ``weights`` [residuals].
+    weighted residuals, and their ``weights`` [residuals]. ``slack`` are constraints
+    that a step may meet.
     """
 
     point: np.ndarray
@@ -39,6 +60,7 @@ class LocalModel(NamedTuple):
     metric: Any = 1.0
     jacobian: Any = None
     weights: Any = None
+    slack: Slack | None = None
 
     @property
     def finite(self) -> bool:
@@ -49,10 +71,41 @@ class LocalModel(NamedTuple):
 
     def predicted(self, step: np.ndarray) -> float:
         """Return the change of the loss that the model predicts for ``step``."""
-        return float(self.gradient @ step + 0.5 * step @ self.curvature @ step)
+        change = float(self.gradient @ step + 0.5 * step @ self.curvature @ step)
+        if self.slack is None:
+            return change
+        return change + 0.5 * float(
+            np.sum(np.maximum(self.slack.after(step), 0.0) ** 2)
+        )
+
+    def _meeting(self, met: np.ndarray) -> "LocalModel":
+        """Return the model with those of its ``slack`` that are ``met``."""
+        assert self.slack is not None
+        jacobian = self.slack.jacobian[:, met]
+        return self._replace(
+            gradient=self.gradient + jacobian @ self.slack.values[met],
+            curvature=self.curvature + jacobian @ jacobian.T,
+            slack=None,
+        )
 
     def step(self, damping: float, box: Box) -> np.ndarray:
         """Return the damped step within the box.
+
+        It heeds the constraints with ``slack`` that it meets.
+        """
+        step = self._within(damping, box)
+        if self.slack is None:
+            return step
+        met = np.zeros(self.slack.values.shape, bool)
+        for _ in range(MEETINGS):
+            before, met = met, self.slack.after(step) > 0.0
+            if np.array_equal(before, met):
+                break
+            step = self._meeting(met)._within(damping, box)
+        return step
+
+    def _within(self, damping: float, box: Box) -> np.ndarray:
+        """Return the damped step of the quadratic model within the box.
 
         An unknown that would leave the box stops at its bound, and the others are
         solved for again.
@@ -84,8 +137,10 @@ class LocalModel(NamedTuple):
         if not np.all(np.isfinite(residuals)) or not free.any():
             return step
         force = -(self.jacobian @ (residuals * self.weights) + damping * step)
+        slack = self.slack
+        model = self._meeting(residuals[slack.places] > 0.0) if slack else self
         change = np.zeros_like(step)
-        change[free] = self._solution(force, damping, free)
+        change[free] = model._solution(force, damping, free)
         if np.linalg.norm(change) > LARGEST_CORRECTION * np.linalg.norm(step):
             return step
         return np.clip(end + change, lower, upper) - self.point

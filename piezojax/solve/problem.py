@@ -36,10 +36,10 @@ class Errors(NamedTuple):
     """Least-squares form of a problem at a point.
 
     ``loss`` is minimised; ``errors`` are a sample of the errors of each run, ``added``
-    the terms of the augmented Lagrangian. A weight is the derivative of the loss with
-    respect to half the mean square of the errors of a run. Half the weighted sum of
-    these mean squares, plus the sum of the squared added terms, has the gradient of the
-    loss, as far as the loss depends on these terms.
+    the ``signed_terms`` of the augmented Lagrangian. A weight is the derivative of the
+    loss with respect to half the mean square of the errors of a run. Half the weighted
+    sum of these mean squares, plus the sum of the squares of the added terms above 0,
+    has the gradient of the loss, as far as the loss depends on these terms.
     """
 
     loss: Float[Array, ""]

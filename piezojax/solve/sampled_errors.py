@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .gauss_newton import Trials
-from .local_model import LocalModel
+from .local_model import LocalModel, Slack
 from .problem import FAILED_LOSS, Errors
 
 SAMPLES = 20_000
@@ -22,13 +22,14 @@ _ADDED = np.sqrt(2.0)  # the squared terms of the Lagrangian have the factor 1, 
 
 
 class Derivatives(NamedTuple):
-    """Loss, weights of the errors, and derivatives at a point.
+    """Loss, ``terms`` of the augmented Lagrangian, and derivatives at a point.
 
-    ``gradient`` is that of the loss, ``jacobian`` that of the errors and ``added`` that
-    of the terms of the augmented Lagrangian.
+    ``weights`` are those of the errors. ``gradient`` is that of the loss, ``jacobian``
+    that of the errors and ``added`` that of the terms.
     """
 
     loss: Float[Array, ""]
+    terms: Float[Array, " constraints"]
     weights: Float[Array, " runs"]
     gradient: Float[Array, " n"]
     jacobian: Float[Array, "n runs samples"]
@@ -43,11 +44,11 @@ def derivatives_at(problem, unit: Float[Array, " n"], every: int) -> Derivatives
         point = problem.errors(unit, every)
         return (point.loss, point.errors, point.added), point.weights
 
-    (loss, *_), (gradient, jacobian, added), weights = jax.vmap(
+    (loss, _, terms), (gradient, jacobian, added), weights = jax.vmap(
         lambda direction: jax.jvp(values, (unit,), (direction,), has_aux=True),
         out_axes=(None, 0, None),
     )(jnp.eye(unit.shape[0]))
-    return Derivatives(loss, weights, gradient, jacobian, added)
+    return Derivatives(loss, terms, weights, gradient, jacobian, added)
 
 
 def local_model(unit: np.ndarray, here: Derivatives) -> LocalModel | None:
@@ -55,16 +56,21 @@ def local_model(unit: np.ndarray, here: Derivatives) -> LocalModel | None:
     slopes, weights = np.asarray(here.jacobian), np.asarray(here.weights)
     unknowns, _, samples = slopes.shape
     scale = np.sqrt(np.maximum(weights, 0.0) / samples)[:, None]
-    jacobian = np.concatenate(
-        [(slopes * scale).reshape(unknowns, -1), _ADDED * here.added], axis=1
-    )
-    scales = np.append(np.repeat(scale, samples), np.full(here.added.shape[1], _ADDED))
+    errors = (slopes * scale).reshape(unknowns, -1)
+    terms, added = _ADDED * np.asarray(here.terms), _ADDED * np.asarray(here.added)
+    slack = ~(terms > 0.0)
+    met = errors, added[:, ~slack]
+    # What has slack may have no derivative, such as a margin that nothing limits.
+    added = np.where(slack & ~np.isfinite(added).all(axis=0), 0.0, added)
     model = LocalModel(
         unit,
         np.asarray(here.gradient),
-        jacobian @ jacobian.T,
-        jacobian=jacobian,
-        weights=scales,
+        sum((each @ each.T for each in met), np.zeros((unknowns, unknowns))),
+        jacobian=np.concatenate([errors, added], axis=1),
+        weights=np.append(np.repeat(scale, samples), np.full(terms.size, _ADDED)),
+        slack=Slack(
+            terms[slack], added[:, slack], errors.shape[1] + np.flatnonzero(slack)
+        ),
     )
     return model if model.finite and here.loss < FAILED_LOSS else None
 
@@ -80,7 +86,8 @@ def trials_of(points: Errors) -> Trials:
     """Return the Trials of points, whose residuals are the errors and added terms."""
     losses, verdicts, errors, added, _ = jax.tree.map(np.asarray, points)
     flat = errors.reshape(len(losses), -1)
-    return Trials(losses, verdicts, np.concatenate([flat, added], axis=1))
+    residuals = np.concatenate([flat, np.maximum(added, 0.0)], axis=1)
+    return Trials(losses, verdicts, residuals)
 
 
 def spacing(runs: int, counted: int) -> int:

@@ -23,7 +23,7 @@ from ..core.feedback import Feedback
 from ..core.metrics import Extremes, TrackingFigures
 from ..core.rollout import BLOCK, in_blocks
 from ..core.space import Space
-from ..solve.augmented_lagrangian import PENALTY, penalty_terms
+from ..solve.augmented_lagrangian import PENALTY, signed_terms
 from ..solve.problem import FAILED_LOSS, Errors, Verdict
 from ..study import Stage
 from .runs import Signals, sampled
@@ -285,7 +285,7 @@ class Objective(eqx.Module):
         multipliers = self.multipliers
         if multipliers.size == 0:
             multipliers = jnp.zeros_like(violation)
-        return penalty_terms(violation, multipliers, self.penalty)
+        return signed_terms(violation, multipliers, self.penalty)
 
     def loss(self, unit: Float[Array, " n"]) -> Float[Array, ""]:
         """Return the loss; ``FAILED_LOSS`` if a run diverges or stays at a limit."""
@@ -298,12 +298,12 @@ class Objective(eqx.Module):
         return self._evaluate(self.figures(unit))[:2]
 
     def _evaluate(self, figures: LoopFigures) -> tuple[Array, Verdict, Array]:
-        """Return the loss, the verdict, and the square roots of the penalty terms."""
+        """Return the loss, the verdict, and the ``signed_terms``."""
         total, violation = self._error_and_violations(figures)
         added = self._added(violation)
         loss, alone = (
             jnp.where(jnp.isfinite(x), x, FAILED_LOSS)
-            for x in (total + jnp.sum(added**2), total)
+            for x in (total + jnp.sum(jnp.maximum(added, 0.0) ** 2), total)
         )
         return loss, Verdict(alone, violation), added
 
@@ -334,7 +334,8 @@ class Objective(eqx.Module):
         for weight, value in self._prices(loop.tracking):
             if weight > 0.0:
                 parts.append(jnp.sqrt(weight * value)[None])
-        parts.append(self._added(violations(self.limits, loop)))
+        added = self._added(violations(self.limits, loop))
+        parts.append(jnp.maximum(added, 0.0))
         every = jnp.concatenate(parts)
         finite = jnp.all(jnp.isfinite(every))
         return jnp.where(finite, every, jnp.sqrt(FAILED_LOSS / every.size))

@@ -615,6 +615,20 @@ MUTATIONS = (
         ("tests/tuning/test_slow_modes.py", "-k", "search"),
     ),
     Mutation(
+        "steps that ignore the constraints they meet",
+        "solve/sampled_errors.py",
+        "slack = ~(terms > 0.0)",
+        "slack = terms > np.inf",
+        ("tests/tuning/test_gauss_newton.py",),
+    ),
+    Mutation(
+        "corrections that ignore the constraints a step has met",
+        "solve/local_model.py",
+        "self._meeting(residuals[slack.places] > 0.0) if slack else self",
+        "self",
+        ("tests/tuning/test_gauss_newton.py",),
+    ),
+    Mutation(
         "gains without the alarms of the plant that a study accepts",
         "tuning/model_alarms.py",
         "yield from about.unsafe",
