@@ -212,7 +212,7 @@ def main(
     def body(console):
         print_loading(console)
         from ..identification.estimators.estimate import Options
-        from ..identification.fit import identify
+        from ..identification.make_fit import identify
         from ..identification.methods import method_for
         from ..identification.records.record import read_record
         from ..report.fit_page import fit_page

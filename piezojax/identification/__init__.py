@@ -27,7 +27,7 @@ from .estimators.steady_state import fit_structure as fit_structure
 from .estimators.steady_state import steady_response as steady_response
 from .fit import Fit as Fit
 from .fit import FitReport as FitReport
-from .fit import identify as identify
+from .make_fit import identify as identify
 from .methods import METHODS as METHODS
 from .ranking import ModelRanking as ModelRanking
 from .records.record import Record as Record

@@ -10,7 +10,8 @@ from .across import errors_across
 from .candidates import Candidate, parts_at
 from .criteria import Criteria, criteria, effective_samples, first_equivalent, ranking
 from .estimators.estimate import Options
-from .fit import Fit, identify
+from .fit import Fit
+from .make_fit import identify
 from .ranking import RankedModel
 from .records.record import Record
 from .unfinished import Finished, Unfinished

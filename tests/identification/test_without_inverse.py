@@ -6,7 +6,7 @@ import pytest
 import piezojax as pj
 from piezojax.dynamics import FirstOrderLag
 from piezojax.hysteresis import DahlFrictions
-from piezojax.identification.fit import _without_inverse
+from piezojax.identification.make_fit import _without_inverse
 from piezojax.identification.records.record import Record
 
 INPUT = 50.0 - 40.0 * np.cos(0.05 * np.arange(400))
