@@ -42,6 +42,7 @@ _TIGHTEN = (
     "begin with gains of a stable loop, lower the bounds of the gains, or raise "
     "'candidates' and 'steps'"
 )
+_DRAW = "draw more plants for the search (ensemble.margins, ensemble.tune)"
 
 
 def alarms_of(
@@ -262,11 +263,14 @@ def _limit_alarms(
     limits: Mapping[str, ConstraintOutcome], perturbed: Perturbed | None
 ) -> Iterable[str]:
     held_out = perturbed.constraints if perturbed else {}
-    for where, outcomes in (("tuned", limits), ("held-out", held_out)):
+    for where, outcomes, remedy in (
+        ("tuned", limits, _TIGHTEN),
+        ("held-out", held_out, _DRAW),
+    ):
         for name, outcome in outcomes.items():
             if not outcome.kept:
                 plants = f"{outcome.of - outcome.on} of {outcome.of} {where} plants"
-                yield _missed(name, outcome.value, outcome.limit, plants)
+                yield _missed(name, outcome.value, outcome.limit, plants, remedy)
 
 
 def _holdout_alarms(limits: Mapping[str, ConstraintOutcome]) -> Iterable[str]:
@@ -279,14 +283,16 @@ def _holdout_alarms(limits: Mapping[str, ConstraintOutcome]) -> Iterable[str]:
             yield _missed(name, outcome.value, outcome.limit, "the hold-out")
 
 
-def _missed(name: str, value: float | None, limit: float, where: str) -> str:
+def _missed(
+    name: str, value: float | None, limit: float, where: str, remedy: str = _TIGHTEN
+) -> str:
     kind = CONSTRAINTS[name]
     unit = "" if kind.unit == "1" else f" {kind.unit}"
     side = "above" if kind.sense == "at most" else "below"
     shown = "not known" if value is None else f"{value:.3g}{unit}"
     return (
         f"{name} is {shown} on {where}, {side} its limit {limit:g}{unit}: "
-        f"{kind.remedy or _TIGHTEN}, or change constraints.{name}"
+        f"{kind.remedy or remedy}, or change constraints.{name}"
     )
 
 

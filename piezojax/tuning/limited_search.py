@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..analysis.constraints import uses
+from ..analysis.constraints import CONSTRAINTS, uses
 from ..analysis.stability import StabilityReports, stability_reports
 from ..core.arrays import as_array
 from ..core.progress import Progress
@@ -20,6 +20,10 @@ from .search import search_box
 REPEATS, LEAST_SHARE = 5, 0.3
 """Largest number of repeated searches, and the smallest factor on (limit - 1) of Ms in
 one of them."""
+
+RESERVE = 0.01
+"""Share of a limit on margins by which a search stays inside it on drawn plants,
+because the worst of other plants is worse than that of the drawn ones."""
 
 Found = tuple[Objective, SearchState, Strategy | None, StabilityReports]
 
@@ -41,12 +45,10 @@ def search_within_limits(
     result, which is often nearer to the best gains than any point that keeps the
     limits. If margins are limited on many plants, a search uses only the worst of them.
     """
-    study = case.study
-    own = {
-        name: study.limits[name] for name in study.constraints if name in study.limits
-    }
-    every = objective.with_limits(study.limits)
-    if uses(own, "margins") or study.pareto or own == study.limits:
+    study, limits = case.study, searched_limits(case)
+    own = {name: limits[name] for name in study.constraints if name in limits}
+    every = objective.with_limits(limits)
+    if uses(own, "margins") or study.pareto or own == limits:
         carried = evaluator.worst_plants(case.loop)
         every = every.on_margin_stages(carried.stages)
         search, strategy = search_box(every, case, progress, also)
@@ -71,6 +73,16 @@ def search_within_limits(
     again.evaluations += search.evaluations
     again = _or_from(search, every, case, again, strategy, progress)
     return _repeated(every, case, evaluator, carried, again, strategy, progress)
+
+
+def searched_limits(case: Case) -> dict[str, float]:
+    """Return the limits of a search, with a ``RESERVE`` if plants are drawn."""
+    limits = dict(case.study.limits)
+    for name in limits if case.ensemble else ():
+        if CONSTRAINTS[name].source == "margins":
+            upper = CONSTRAINTS[name].sense == "at most"
+            limits[name] *= 1.0 - RESERVE if upper else 1.0 + RESERVE
+    return limits
 
 
 INTERRUPTED = StabilityReports(problems={"after": "their computation was interrupted"})
@@ -164,7 +176,7 @@ def _repeated(
     the limit of the next search is tightened. If a drawn plant violates a limit, the
     worst plants replace part of those that the search carries.
     """
-    limits = dict(case.study.limits)
+    limits = searched_limits(case)
     try:
         stability = exact_stability(case, search)
         for _ in range(REPEATS):

@@ -213,7 +213,8 @@ def test_the_heading_counts_the_alarms(alarms, heading):
         ),
         (
             {"perturbed": perturbed(effort=outcome("effort", [1.0, math.nan], 50.0))},
-            "effort is not known on 1 of 2 held-out plants, above its limit",
+            "effort is not known on 1 of 2 held-out plants, above its limit 50 V rms: "
+            "draw more plants",
         ),
         (
             {"perturbed": perturbed(unstable=2)},
