@@ -1,5 +1,7 @@
 """Search of a study within its limits, checked by the exact margins."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from ..analysis.constraints import CONSTRAINTS, uses
@@ -45,7 +47,8 @@ def search_within_limits(
     result, which is often nearer to the best gains than any point that keeps the
     limits. If margins are limited on many plants, a search uses only the worst of them.
     """
-    study, limits = case.study, searched_limits(case)
+    study = case.study
+    limits = searched_limits(study.limits, case.ensemble is not None)
     own = {name: limits[name] for name in study.constraints if name in limits}
     every = objective.with_limits(limits)
     if uses(own, "margins") or study.pareto or own == limits:
@@ -75,14 +78,14 @@ def search_within_limits(
     return _repeated(every, case, evaluator, carried, again, strategy, progress)
 
 
-def searched_limits(case: Case) -> dict[str, float]:
-    """Return the limits of a search, with a ``RESERVE`` if plants are drawn."""
-    limits = dict(case.study.limits)
-    for name in limits if case.ensemble else ():
+def searched_limits(limits: Mapping[str, float], drawn: bool) -> dict[str, float]:
+    """Return the ``limits`` of a search, with a ``RESERVE`` if plants are drawn."""
+    found = dict(limits)
+    for name in limits if drawn else ():
         if CONSTRAINTS[name].source == "margins":
             upper = CONSTRAINTS[name].sense == "at most"
-            limits[name] *= 1.0 - RESERVE if upper else 1.0 + RESERVE
-    return limits
+            found[name] *= 1.0 - RESERVE if upper else 1.0 + RESERVE
+    return found
 
 
 INTERRUPTED = StabilityReports(problems={"after": "their computation was interrupted"})
@@ -176,7 +179,7 @@ def _repeated(
     the limit of the next search is tightened. If a drawn plant violates a limit, the
     worst plants replace part of those that the search carries.
     """
-    limits = searched_limits(case)
+    limits = searched_limits(case.study.limits, case.ensemble is not None)
     try:
         stability = exact_stability(case, search)
         for _ in range(REPEATS):

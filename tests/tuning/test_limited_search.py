@@ -67,6 +67,7 @@ def repeated(monkeypatch, peaks, plants=(), status="converged", strategy="a stra
             limits={"sensitivity_peak": 2.0, "effort": 1.0},
             optimiser=SimpleNamespace(steps=7),
         ),
+        ensemble=None,
         space=SimpleNamespace(put=lambda loop, unit: loop),
         loop=None,
     )
