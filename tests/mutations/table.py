@@ -629,6 +629,13 @@ MUTATIONS = (
         ("tests/tuning/test_gauss_newton.py",),
     ),
     Mutation(
+        "a search without a reserve for other plants",
+        "tuning/limited_search.py",
+        "RESERVE = 0.01",
+        "RESERVE = 0.0",
+        ("tests/tuning/test_robust.py", "-k", "reserve"),
+    ),
+    Mutation(
         "gains without the alarms of the plant that a study accepts",
         "tuning/model_alarms.py",
         "yield from about.unsafe",
