@@ -59,13 +59,13 @@ def local_model(unit: np.ndarray, here: Derivatives) -> LocalModel | None:
     errors = (slopes * scale).reshape(unknowns, -1)
     terms, added = _ADDED * np.asarray(here.terms), _ADDED * np.asarray(here.added)
     slack = ~(terms > 0.0)
-    met = errors, added[:, ~slack]
+    met = added[:, ~slack]
     # What has slack may have no derivative, such as a margin that nothing limits.
     added = np.where(slack & ~np.isfinite(added).all(axis=0), 0.0, added)
     model = LocalModel(
         unit,
         np.asarray(here.gradient),
-        sum((each @ each.T for each in met), np.zeros((unknowns, unknowns))),
+        errors @ errors.T + met @ met.T,
         jacobian=np.concatenate([errors, added], axis=1),
         weights=np.append(np.repeat(scale, samples), np.full(terms.size, _ADDED)),
         slack=Slack(

@@ -23,7 +23,7 @@ from ..core.feedback import Feedback
 from ..core.metrics import Extremes, TrackingFigures
 from ..core.rollout import BLOCK, in_blocks
 from ..core.space import Space
-from ..solve.augmented_lagrangian import PENALTY, signed_terms
+from ..solve.augmented_lagrangian import PENALTY, penalty_terms, signed_terms
 from ..solve.problem import FAILED_LOSS, Errors, Verdict
 from ..study import Stage
 from .runs import Signals, sampled
@@ -281,11 +281,12 @@ class Objective(eqx.Module):
         prices = [weight * value for weight, value in self._prices(loop.tracking)]
         return self._error(loop.tracking) + sum(prices), violations(self.limits, loop)
 
-    def _added(self, violation: Array) -> Array:
+    def _terms(self, of: Callable[..., Array], violation: Array) -> Array:
+        """Return ``signed_terms`` or ``penalty_terms`` with the multipliers, if any."""
         multipliers = self.multipliers
         if multipliers.size == 0:
             multipliers = jnp.zeros_like(violation)
-        return signed_terms(violation, multipliers, self.penalty)
+        return of(violation, multipliers, self.penalty)
 
     def loss(self, unit: Float[Array, " n"]) -> Float[Array, ""]:
         """Return the loss; ``FAILED_LOSS`` if a run diverges or stays at a limit."""
@@ -300,12 +301,11 @@ class Objective(eqx.Module):
     def _evaluate(self, figures: LoopFigures) -> tuple[Array, Verdict, Array]:
         """Return the loss, the verdict, and the ``signed_terms``."""
         total, violation = self._error_and_violations(figures)
-        added = self._added(violation)
+        penalty = jnp.sum(self._terms(penalty_terms, violation) ** 2)
         loss, alone = (
-            jnp.where(jnp.isfinite(x), x, FAILED_LOSS)
-            for x in (total + jnp.sum(jnp.maximum(added, 0.0) ** 2), total)
+            jnp.where(jnp.isfinite(x), x, FAILED_LOSS) for x in (total + penalty, total)
         )
-        return loss, Verdict(alone, violation), added
+        return loss, Verdict(alone, violation), self._terms(signed_terms, violation)
 
     def errors(self, unit: Float[Array, " n"], every: int) -> Errors:
         """Return the loss, its terms, and every ``every``-th error of each run."""
@@ -334,8 +334,7 @@ class Objective(eqx.Module):
         for weight, value in self._prices(loop.tracking):
             if weight > 0.0:
                 parts.append(jnp.sqrt(weight * value)[None])
-        added = self._added(violations(self.limits, loop))
-        parts.append(jnp.maximum(added, 0.0))
+        parts.append(self._terms(penalty_terms, violations(self.limits, loop)))
         every = jnp.concatenate(parts)
         finite = jnp.all(jnp.isfinite(every))
         return jnp.where(finite, every, jnp.sqrt(FAILED_LOSS / every.size))
