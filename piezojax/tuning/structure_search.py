@@ -243,7 +243,8 @@ def _starts(
     if previous is not None:
         tuned = own | _carried(previous, at, place)
         points += switched_on(tuned, previous.at) + switched_on(tuned, ())
-    return np.stack([_unit(variant, values) for values in points])
+    # Before the first notch the last two are the same.
+    return np.unique([_unit(variant, values) for values in points], axis=0)
 
 
 def _carried(previous: _Tuned, at: Modes, place: str) -> dict[str, float]:

@@ -477,13 +477,14 @@ def test_the_search_goes_on_from_the_gains_before():
     searched(tuning)
     none, one, two = tuning.starts
     assert none is None
-    assert one.shape == (6, 4)
-    assert two.shape == (6, 7)
+    # Each start once: these searches return the gains of the study.
+    assert one.shape == (2, 4)
+    assert two.shape == (4, 7)
     # The second notch is on in every start, the first as it was tuned in two of them.
     first, second = two[:, 3], two[:, 6]
-    np.testing.assert_allclose(second, [0.05, 0.05] * 3, rtol=1e-6)
-    np.testing.assert_allclose(first[2:4], DEPTH, rtol=1e-6)
-    assert np.all(first[[0, 1, 4, 5]] < DEPTH)
+    np.testing.assert_allclose(second, [0.05, 0.05] * 2, rtol=1e-6)
+    np.testing.assert_allclose(np.sort(first)[2:], DEPTH, rtol=1e-6)
+    assert np.all(np.sort(first)[:2] < DEPTH)
 
 
 def test_a_mode_below_the_error_bound_of_the_model_may_be_noise():
