@@ -16,8 +16,9 @@ from .multi_start import Patience, in_batches, in_threads
 from .problem import Errors, Problem, Verdict
 from .sampled_errors import derivatives_at, errors_at, local_model, trials_of
 
-HALVING_STEPS = 3
-"""Number of steps after which the worse half of the descents is dropped."""
+HALVING_STEPS = 10
+"""Number of steps after which the worse half of the descents is dropped. After
+fewer steps the loss does not tell which valley has the lowest constrained minimum."""
 
 PATIENCE = 5
 """Number of steps in which a descent must gain its tolerance."""

@@ -17,6 +17,7 @@ from piezojax import (
 )
 from piezojax.core.arrays import as_array
 from piezojax.core.feedback import loop_inputs
+from piezojax.solve import successive_halving
 from piezojax.solve.clock import Clock
 from piezojax.solve.gauss_newton import PARALLEL, Descent, GaussNewton
 from piezojax.solve.local_model import UNIT_BOX, LocalModel, Slack
@@ -228,8 +229,9 @@ def test_spacing_is_prime_and_keeps_enough_samples(runs, counted):
     assert runs * counted / every <= 25_000
 
 
-def test_the_better_half_continues():
+def test_the_better_half_continues(monkeypatch):
     """Of nine descents five continue, then three; the best ones are never dropped."""
+    monkeypatch.setattr(successive_halving, "HALVING_STEPS", 3)
     places = np.random.default_rng(1).uniform(0.0, 0.2, (9, 2))
     seen = []
     standing, ended = descend(
