@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from ..analysis.stability.closed_poles import poles_of, slowest_oscillation
 from ..analysis.stability.small_motion import duration_of
@@ -123,12 +123,22 @@ class Case:
     def margin_duration(self) -> float:
         """Length of the impulse responses of margins in searches and sweeps, s.
 
-        It follows from the slowest oscillation of the plant about 0 V. It must be known
-        before a program uses it.
+        It follows from the slowest oscillation about 0 V of the plant and of the drawn
+        plants whose margins are limited. It must be known before a program uses it.
         """
         dt, rest = self.study.dt, as_signal(np.zeros(np.shape(self.margin_reference)))
-        matrix = linearise(resolve(self.loop.plant), rest, dt=dt).A
-        slowest = slowest_oscillation(poles_of(np.asarray(matrix)[None])).item()
+
+        def matrix(plant: System) -> Float[Array, "n n"]:
+            return linearise(resolve(plant), rest, dt=dt).A
+
+        def of_stages(stages: Stage) -> Float[Array, "stages n n"]:
+            return jax.lax.map(lambda stage: matrix(stage.plant), stages)
+
+        drawn = self.ensemble.stages("margins") if self.ensemble else None
+        found = [matrix(self.loop.plant)[None]]
+        if drawn is not None:
+            found.append(jax.jit(of_stages)(drawn))
+        slowest = np.max(slowest_oscillation(poles_of(np.concatenate(found)))).item()
         return duration_of(dt * slowest, dt, SEARCHED, MOST_SEARCHED)
 
     @cached_property

@@ -39,7 +39,7 @@ class EnsembleTable(Table):
     """Number of drawn stages in the objective, in addition to the nominal one."""
     margins: Annotated[int, Field(strict=True, ge=0, le=1024)] = 64
     """Number of drawn stages on which margins are limited, in addition to the nominal
-    one; the first of them are those of ``tune``. If there are more than 64, a search
+    one; the first of them are those of ``tune``. If there are more than 15, a search
     uses the worst ones only, and its result is checked on all."""
     holdout: Annotated[int, Field(strict=True, ge=1, le=1024)] = 50
     """Number of other stages on which the tuned gains are evaluated."""

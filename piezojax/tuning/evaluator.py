@@ -1,5 +1,6 @@
 """Evaluation of loops on signals and stages, compiled once per shape and structure."""
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -31,20 +32,18 @@ from ..core.metrics import ExtremeFigures, Extremes, TrackingFigures
 from ..core.rollout import Metric
 from ..solve.clock import Clock
 from ..solve.multi_start import in_batches, in_threads, rows_of
+from ..solve.problem import TOLERANCE
 from ..study import Case, Stage
 from ..study.ensemble import Part
+from .alarms import PEAK
 from .data import held, own_stage
 from .level_stages import level_stages
 from .objective import MARGIN_BLOCK, StepTest, margins_on
 from .runs import Signals, evaluate
 from .steep_stage import steep_stage
 
-EVERY = 65
-"""Number of plants up to which a search computes the margins of all at every point: the
-default number of an ensemble and the nominal plant."""
-
 CARRIED = 16
-"""Number of plants whose margins a search computes if there are more than ``EVERY``."""
+"""Most plants whose margins a search computes at every point."""
 
 SETTLED, MOST = 7.0, 2**17
 """Time constants of an oscillation after which 0.1 % of it is left, and the most
@@ -58,12 +57,14 @@ RUN_BLOCK = 8
 class Carried(NamedTuple):
     """Part of the plants with limited margins: those whose margins a search computes.
 
-    ``excess`` is the largest ln(value/limit) over all plants and limits. ``stages`` are
-    the carried plants, and ``places`` their indices among all. If all are carried,
-    ``stages`` is None and ``excess`` 0.
+    ``excess`` is the largest ln(value/limit) over all plants and limits. ``peak`` is
+    the largest Ms of the plants carried so far if it exceeds its limit, otherwise 0.
+    ``stages`` are the plants to carry, and ``places`` their indices among all. If all
+    are carried, ``stages`` is None.
     """
 
     excess: float
+    peak: float
     stages: Stage | None
     places: np.ndarray
 
@@ -122,22 +123,14 @@ class Evaluator:
         """Return the figures of the study's limits, with the plants on the first axis.
 
         The runs are on ``stages``, the margins on ``margin_stages``, both stacked; None
-        means the plant of the loop alone. On stacked stages the poles of the closed
-        loops tell which are stable and how long their impulse responses last: where
-        that exceeds the duration for a search, the margins are those of longer ones.
+        means the plant of the loop alone.
         """
         tracking, extremes = self._runs(loop, signals, stages)
         steps, dt = self._steps(loop, stages), self._case.study.dt
         if margin_stages is None:
             margins = self._margins(loop, None)
             return LoopFigures(tracking, extremes, margins, steps, dt)
-        closed = self._on_margin_stages(_closed_on, loop, margin_stages)
-        poles = poles_of(np.asarray(closed))
-        known = stable(poles)
-        slowest = dt * np.max(slowest_oscillation(poles)[known], initial=0.0)
-        duration = duration_of(slowest, dt, SETTLED, MOST)
-        margins = self._margins(loop, margin_stages, duration)
-        margins = margins and without_unstable(margins, known)
+        margins, known = self._margins_of_stable(loop, margin_stages)
         return LoopFigures(tracking, extremes, margins, steps, dt, known)
 
     def _runs(
@@ -175,24 +168,54 @@ class Evaluator:
         return jax.tree.map(jnp.asarray, found)
 
     def worst_plants(self, loop: Feedback, before: Carried | None = None) -> Carried:
-        """Return the plants that a search from ``loop`` carries.
+        """Return the plants that a search from ``loop`` carries: at most ``CARRIED``.
 
-        Of more than ``EVERY`` plants it carries ``CARRIED``: those with the largest
-        excess over the limits on margins. Up to half of them are the worst of those
-        carried ``before``, so that a search keeps the plants whose limits were active.
+        They are those with the largest excess over the limits on margins. Up to half of
+        them are the worst of those carried ``before``, so that a search keeps the
+        plants whose limits were active. After a search the margins are those of
+        ``limited``, which may be worse than those of the search.
         """
-        stages = self.margin_stages
-        if _count(stages) <= EVERY or not uses(self.limits, "margins"):
-            return Carried(0.0, None, np.empty(0, int))
-        margins = self._margins(loop, stages)
-        assert margins is not None
+        stages, count = self.margin_stages, _count(self.margin_stages)
+        if stages is None or (before is None and count <= CARRIED):
+            return Carried(0.0, 0.0, None, np.arange(count))
+        if before is None:
+            margins = self._margins(loop, stages)
+        else:
+            margins, _ = self._margins_of_stable(loop, stages)
+        assert margins is not None  # with stages some margin is limited
         by = np.asarray(worst_excess(self.limits, margins))
         worst = np.argsort(-by, kind="stable")
         kept = worst[:0] if before is None else worst[np.isin(worst, before.places)]
+        peak = self._exceeding_peak(margins, kept)
+        if count <= CARRIED:
+            return Carried(float(by[worst[0]]), peak, None, np.arange(count))
         first = np.concatenate([worst[: CARRIED // 2], kept[: CARRIED // 2], worst])
         places = first[np.sort(np.unique(first, return_index=True)[1])][:CARRIED]
         carried = jax.tree.map(lambda x: x[places], stages)
-        return Carried(float(by[worst[0]]), carried, places)
+        return Carried(float(by[worst[0]]), peak, carried, places)
+
+    def _exceeding_peak(self, margins: MarginFigures, places: np.ndarray) -> float:
+        """Return the largest Ms of the plants at ``places`` if it exceeds its limit."""
+        if PEAK not in margins:
+            return 0.0
+        peak = float(np.max(np.asarray(margins[PEAK])[places], initial=0.0))
+        return peak if peak > self.limits[PEAK] * math.exp(TOLERANCE) else 0.0
+
+    def _margins_of_stable(
+        self, loop: Feedback, stages: Stage
+    ) -> tuple[MarginFigures | None, np.ndarray]:
+        """Return the margins on ``stages``, and which of their loops are stable.
+
+        The poles of the closed loops tell. They also tell how long their impulse
+        responses last: the margins are those of longer ones than in a search if needed.
+        """
+        closed = self._on_margin_stages(_closed_on, loop, stages)
+        poles, dt = poles_of(np.asarray(closed)), self._case.study.dt
+        known = stable(poles)
+        slowest = dt * np.max(slowest_oscillation(poles)[known], initial=0.0)
+        duration = duration_of(slowest, dt, SETTLED, MOST)
+        margins = self._margins(loop, stages, duration)
+        return margins and without_unstable(margins, known), known
 
     def _margins(
         self, loop: Feedback, stages: Stage | None, duration: float = 0.0

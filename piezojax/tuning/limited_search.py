@@ -45,7 +45,7 @@ def search_within_limits(
     compile. Unless the study limits a margin itself, the box is searched without the
     default limits first, and again with them if the result violates one: also from that
     result, which is often nearer to the best gains than any point that keeps the
-    limits. If margins are limited on many plants, a search uses only the worst of them.
+    limits. If margins are limited on many plants, a search carries only the worst.
     """
     study = case.study
     limits = searched_limits(study.limits, case.ensemble is not None)
@@ -174,10 +174,11 @@ def _repeated(
 ) -> Found:
     """Repeat the search, up to REPEATS times, while its result misses a limit.
 
-    The search computes S on a grid of frequencies. Between two of them it may miss the
-    peak of a lightly damped mode of the closed loop: if the exact Ms exceeds its limit,
-    the limit of the next search is tightened. If a drawn plant violates a limit, the
-    worst plants replace part of those that the search carries.
+    The search computes S from impulse responses of one length, on a grid of
+    frequencies, and may miss the peak of a lightly damped mode of the closed loop: if
+    Ms of a carried plant exceeds its limit, the limit of the next search is tightened.
+    If a drawn plant violates a limit, the worst plants replace part of those that the
+    search carries.
     """
     limits = searched_limits(case.study.limits, case.ensemble is not None)
     try:
@@ -187,7 +188,7 @@ def _repeated(
                 break
             loop = case.space.put(case.loop, as_array(search.unit))
             carried = evaluator.worst_plants(loop, carried)
-            peak = _alarming_peak(case, stability)
+            peak = max(_alarming_peak(case, stability), carried.peak)
             if peak:
                 share = (case.study.limits[PEAK] - 1.0) / (peak - 1.0)
                 limits[PEAK] = 1.0 + (limits[PEAK] - 1.0) * max(share, LEAST_SHARE)

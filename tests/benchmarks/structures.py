@@ -85,7 +85,7 @@ def study_of(plant, most=3):
                 "scale": "log",
             },
         },
-        "ensemble": {"spread": spread, "tune": 0, "margins": 16, "holdout": 12},
+        "ensemble": {"spread": spread, "tune": 0, "margins": 256, "holdout": 12},
         "constraints": {"sensitivity_peak": LIMIT},
         "optimiser": {"starts": 2, "candidates": 8, "steps": 15, "tolerance": 1e-3},
         "structures": {"notches": list(range(most + 1))},

@@ -656,7 +656,28 @@ MUTATIONS = (
         "return found",
         ("tests/identification/test_identify.py", "-k", "zero_of_another"),
     ),
-    # Two searches
+    # Searches
+    Mutation(
+        "drawn plants judged by the short responses of a search",
+        "tuning/evaluator.py",
+        "margins, _ = self._margins_of_stable(loop, stages)",
+        "margins = self._margins(loop, stages)",
+        ("tests/tuning/test_slow_modes.py", "-k", "ring_longer"),
+    ),
+    Mutation(
+        "the limit of a search that is not tightened for drawn plants",
+        "tuning/limited_search.py",
+        "peak = max(_alarming_peak(case, stability), carried.peak)",
+        "peak = _alarming_peak(case, stability)",
+        ("tests/tuning/test_limited_search.py", "-k", "rings_longer"),
+    ),
+    Mutation(
+        "a search as long as the oscillation of the nominal plant alone",
+        "study/case.py",
+        "if drawn is not None:",
+        "if drawn is None:",
+        ("tests/tuning/test_slow_modes.py", "-k", "ring_longer"),
+    ),
     Mutation(
         "a second search without the end of the first",
         "tuning/limited_search.py",

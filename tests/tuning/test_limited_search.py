@@ -51,7 +51,8 @@ class Limited:
 def repeated(monkeypatch, peaks, plants=(), status="converged", strategy="a strategy"):
     """Return the limits and plants of each search, and the result.
 
-    ``peaks`` are the exact Ms, ``plants`` the largest excess with the worst plants.
+    ``peaks`` are the exact Ms; ``plants`` are the largest excess, Ms of the carried
+    plants and the worst plants.
     """
     values, found, searched = iter(peaks), iter(plants), []
 
@@ -72,7 +73,7 @@ def repeated(monkeypatch, peaks, plants=(), status="converged", strategy="a stra
         loop=None,
     )
     evaluator = SimpleNamespace(
-        worst_plants=lambda loop, before: Carried(*next(found, (0.0, None)), before)
+        worst_plants=lambda *_: Carried(*next(found, (0.0, 0.0, None)), np.empty(0))
     )
     search = SearchState(
         np.array([0.5]), status=status, evaluations=5, warnings=["the start diverges"]
@@ -102,21 +103,28 @@ def test_the_search_ends_after_five_repetitions(monkeypatch):
 
 
 def test_the_search_is_repeated_until_no_plant_violates_a_limit(monkeypatch):
-    plants = [(0.2, "second"), (1.1e-3, "third"), (9e-4, "fourth")]
+    plants = [(0.2, 0.0, "second"), (1.1e-3, 0.0, "third"), (9e-4, 0.0, "fourth")]
     searched, (objective, *_) = repeated(monkeypatch, [0.0] * 4, plants)
     assert searched == [(None, "second"), (None, "third")]
     assert objective.stages == "third"
 
 
 def test_plants_and_limits_change_in_the_same_search(monkeypatch):
-    searched, _ = repeated(monkeypatch, [3.0, 0.0], [(0.2, "second"), (0.0, None)])
+    searched, _ = repeated(monkeypatch, [3.0, 0.0], [(0.2, 0.0, "second")])
     assert searched == [(1.5, "second")]
+
+
+def test_the_limit_is_tightened_where_a_carried_plant_rings_longer(monkeypatch):
+    plants = [(0.2, 2.6, "second"), (0.1, 2.2, None)]
+    searched, _ = repeated(monkeypatch, [0.0] * 3, plants)
+    aims = 1.0 + 1.0 / 1.6, 1.0 + 1.0 / 1.6 / 1.2
+    assert searched == [(pytest.approx(aim), "second") for aim in aims]
 
 
 @pytest.mark.parametrize(
     "changes",
     [
-        {"peaks": [0.0], "plants": [(1e-4, "second")]},
+        {"peaks": [0.0], "plants": [(1e-4, 0.0, "second")]},
         {"status": "interrupted"},
         {"strategy": None},
     ],

@@ -196,7 +196,6 @@ def test_the_limit_is_kept_and_active_at_the_exact_margin(outcome):
 def test_a_search_on_the_worst_plants_keeps_the_limit_on_all(
     outcome, monkeypatch, tmp_path
 ):
-    monkeypatch.setattr(evaluator, "EVERY", 2)
     monkeypatch.setattr(evaluator, "CARRIED", 2)
     found = pj.tune(written(tmp_path, changed(pareto=None))).result
     kept = found.constraints["sensitivity_peak"]
@@ -205,7 +204,6 @@ def test_a_search_on_the_worst_plants_keeps_the_limit_on_all(
 
 
 def test_the_worst_plants_are_those_with_the_largest_exact_peak(outcome, monkeypatch):
-    monkeypatch.setattr(evaluator, "EVERY", 2)
     monkeypatch.setattr(evaluator, "CARRIED", 2)
     case = dataclasses.replace(
         outcome.case,
@@ -214,7 +212,7 @@ def test_the_worst_plants_are_those_with_the_largest_exact_peak(outcome, monkeyp
         ),
     )
     found = evaluator.Evaluator(Clock(), case)
-    beyond, worst, places = found.worst_plants(outcome.after)
+    beyond, _, worst, places = found.worst_plants(outcome.after)
     own = Stage(case.loop.plant, case.loop.sensor)
     stages = [own, *each(case.ensemble.stages("margins"))]
     peaks = sorted((exact_peak(outcome.after, stage) for stage in stages), reverse=True)
@@ -222,7 +220,9 @@ def test_the_worst_plants_are_those_with_the_largest_exact_peak(outcome, monkeyp
     assert carried == pytest.approx(peaks[:2], rel=1e-9)
     # Half of them were in the search before.
     for old in set(range(5)) - set(places.tolist()):
-        again = found.worst_plants(outcome.after, Carried(0.0, None, np.array([old])))
+        again = found.worst_plants(
+            outcome.after, Carried(0.0, 0.0, None, np.array([old]))
+        )
         assert again.places.tolist() == [places[0], old]
     assert beyond == pytest.approx(np.log(peaks[0] / 1.3), abs=2e-3)
 

@@ -17,7 +17,7 @@ from piezojax.dynamics import Modes
 from piezojax.solve.clock import Clock
 from piezojax.study import read
 from piezojax.tuning.data import make_data
-from piezojax.tuning.evaluator import MOST, SETTLED, Evaluator
+from piezojax.tuning.evaluator import MOST, SETTLED, Evaluator, drawn_stages
 from piezojax.tuning.held_out import held_out
 from piezojax.tuning.result import Perturbed
 from piezojax.tuning.tuner import tune
@@ -118,6 +118,33 @@ def test_a_search_keeps_the_limit_that_the_poles_show(folder):
     integral = found.gains["controller.integral"]
     _, peak = poles_and_peak(4e-3, integral)
     assert 1.9 < peak < 2.0 * 1.001
+
+
+def test_a_search_keeps_the_limit_on_drawn_plants_that_ring_longer(folder):
+    """Plants with a quarter of the damping oscillate four times as long as the own."""
+    table = {
+        **STUDY,
+        "constraints": {"sensitivity_peak": 2.0},
+        "ensemble": {**STUDY["ensemble"], "margins": 4, "holdout": 1},
+        "optimiser": {"starts": 1, "candidates": 4, "steps": 15},
+    }
+    (folder / "drawn.toml").write_text(tomli_w.dumps(table))
+    case = read(folder / "drawn.toml")
+    stages = drawn_stages(case, "margins")
+    assert stages is not None
+    found = tune(case).result
+    integral = found.gains["controller.integral"]
+    dampings = np.asarray(get(stages.plant, "dynamics.damping.0"))
+    peaks = [poles_and_peak(damping, integral)[1] for damping in dampings]
+    assert 1.85 < max(peaks) < 2.0 * 1.005
+    assert found.constraints["sensitivity_peak"].kept
+    # The margins of a search hide it on a loop that violates the limit.
+    larger = replace(case.loop, {"controller.integral": 1.3 * integral})
+    evaluator = Evaluator(Clock(), case)
+    figures = evaluator.worst_plants(larger, evaluator.worst_plants(larger))
+    expected = max(poles_and_peak(damping, 1.3 * integral)[1] for damping in dampings)
+    assert figures.peak == pytest.approx(expected, rel=0.01)
+    assert figures.excess == pytest.approx(np.log(figures.peak / 2.0), abs=1e-3)
 
 
 def test_unstable_plants_are_counted(drawn):
