@@ -56,8 +56,9 @@ def search_structures(case: Case, tune: Tune, progress: Progress) -> Outcome:
     The first notch is placed at the mode around which |S| of the loop tuned without
     notches is largest, each further one at the mode around which |S| of the loop tuned
     so far is largest. A mode that contributes less than ``LIMITING`` to |L| does not
-    limit the loop and gets no notch. If the chosen structure has a needless notch
-    (``Structure.needless``), the controller is tuned without that notch too. ``Ctrl-C``
+    limit the loop and gets no notch. If a further notch is needless
+    (``Structure.needless``), the controller is tuned with a notch at the next mode
+    instead, too; if the chosen structure has one, also without that notch. ``Ctrl-C``
     ends the search with the structures so far.
     Raises ValueError if no structure could be tuned, and as ``with_notches``.
     """
@@ -102,6 +103,9 @@ def search_structures(case: Case, tune: Tune, progress: Progress) -> Outcome:
             rows.append(_untuned(count, at, reason))
             continue
         going = going and run(at, previous)
+        instead = _replaced(found, at, others)
+        if going and instead is not None and set(instead) not in tried:
+            going = run(instead, previous)
         if not going:
             break
     while going and (best := _best(found, table.worth)) is not None:
@@ -165,6 +169,22 @@ def _shown_modes(case: Case) -> tuple[list[PlantMode], list[str]]:
         "bound of the model is larger than its mode there; a record with a chirp up to "
         "half the sampling rate lowers the bound"
     ]
+
+
+def _replaced(
+    found: Sequence[_Tuned], at: Modes, others: Sequence[PlantMode]
+) -> Modes | None:
+    """Return ``at`` with the next of ``others`` in place of needless ones of these.
+
+    None if the structure ``at`` could not be tuned, needs its further notches, or
+    ``others`` has no more modes.
+    """
+    if not found or found[-1].at != at:
+        return None
+    needless = [mode for mode in at if mode.frequency in found[-1].row.needless]
+    free = [mode for mode in others if mode not in at]
+    swaps = dict(zip((m for m in needless if m in others), free, strict=False))
+    return tuple(swaps.get(mode, mode) for mode in at) if swaps else None
 
 
 def _limiting(modes: Sequence[PlantMode], tuned: _Tuned | None) -> list[PlantMode]:

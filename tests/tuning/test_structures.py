@@ -447,6 +447,25 @@ def test_a_notch_that_the_loop_does_not_need_is_dropped():
     assert tuning.calls == [(), (400,), (400, 900)]
 
 
+def test_a_notch_at_the_wrong_of_two_modes_is_moved():
+    """The mode at 400 Hz limits nothing with its notch off; that at 900 Hz does."""
+    errors = {(): 1.0, (400,): 0.5, (900,): 0.4}
+    tuning = Pretended(errors, ALL | {(400,): [0.13, 0.5, 1e-4]})
+    limits = {"sensitivity_peak": 1.8, "delay_margin": "off"}
+    changes = {"structures": {"notches": [0, 1]}, "constraints": limits}
+    rows = searched(tuning, **changes).structures.structures
+    assert tuning.calls == [(), (400,), (900,)]
+    assert [r.at_Hz for r in rows if r.chosen] == [pytest.approx([900.0])]
+    # There is no third mode that limits the loop.
+    tuning = Pretended(errors, {(): [0.5, 0.05, 1e-4], (400,): [0.13, 0.05, 1e-4]})
+    searched(tuning, **changes)
+    assert tuning.calls == [(), (400,)]
+    # If the other structure cannot be tuned, the search goes on.
+    tuning = Pretended(errors | {(900,): None}, ALL | {(400,): [0.13, 0.5, 1e-4]})
+    rows = searched(tuning, **changes).structures.structures
+    assert [r.chosen for r in rows] == [True, False, False]
+
+
 @pytest.mark.parametrize(
     ("limit", "part", "needed"),
     [  # with its notch of depth 0.3 off, the mode makes part/0.3 of |L|
@@ -460,7 +479,8 @@ def test_a_notch_at_a_mode_that_cannot_limit_the_loop_is_not_chosen(
     limit, part, needed
 ):
     """The notch halves the error all the same, by its phase."""
-    tuning = Pretended({(): 1.0, (400,): 0.5}, ALL | {(400,): [part, 0.05, 1e-4]})
+    alone = {(): [0.5, 0.05, 1e-4], (400,): [part, 0.05, 1e-4]}
+    tuning = Pretended({(): 1.0, (400,): 0.5}, alone)
     result = searched(
         tuning,
         structures={"notches": [0, 1]},
