@@ -178,6 +178,34 @@ class BatchedDescents:
         self._carry = jax.tree.map(lambda leaf: leaf[rows], self._carry)
 
 
+class Abreast:
+    """Descents, each with its own problem, that advance in parallel threads.
+
+    Each of ``descents`` has one start.
+    """
+
+    def __init__(self, descents: Sequence[Descents]):
+        self._descents, self._places = list(descents), np.arange(len(descents))
+
+    def advance(self) -> DescentStatus:
+        """Move every descent by one step; return their status."""
+        every = in_threads(lambda descent: descent.advance(), self._descents)
+        units, losses, verdict, done, _, taken = zip(*every, strict=True)
+        return DescentStatus(
+            np.concatenate(units),
+            np.concatenate(losses),
+            jax.tree.map(lambda *parts: np.concatenate(parts), *verdict),
+            np.concatenate(done),
+            self._places,
+            sum(taken),
+        )
+
+    def keep(self, rows: np.ndarray) -> None:
+        """Keep only the descents at ``rows`` of the last DescentStatus."""
+        self._descents = [self._descents[row] for row in rows]
+        self._places = self._places[rows]
+
+
 @runtime_checkable
 class Strategy(Protocol):
     """Strategy to minimise a Problem from many starts, with its compiled programs.

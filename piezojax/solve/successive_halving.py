@@ -12,13 +12,17 @@ from .augmented_lagrangian import with_zero_multipliers
 from .clock import Clock, compiled
 from .gauss_newton import PARALLEL, Descent, GaussNewton, Trials
 from .local_model import UNIT_BOX, LocalModel
-from .multi_start import Patience, in_batches, in_threads
+from .multi_start import Abreast, Patience, in_batches, in_threads
 from .problem import Errors, Problem, Verdict
 from .sampled_errors import derivatives_at, errors_at, local_model, trials_of
 
 HALVING_STEPS = 10
 """Number of steps after which the worse half of the descents is dropped. After
 fewer steps the loss does not tell which valley has the lowest constrained minimum."""
+
+FINALISTS = 2
+"""Number of descents that are never dropped. The constraints are loose in the first
+round of an augmented Lagrangian; its best valley may not be the best with them."""
 
 PATIENCE = 5
 """Number of steps in which a descent must gain its tolerance."""
@@ -28,8 +32,12 @@ LANES = 32
 
 
 def better_half(step: int, running: int) -> int | None:
-    """Return the number of descents kept: half, rounded up, every HALVING_STEPS."""
-    return (running + 1) // 2 if step % HALVING_STEPS == 0 else None
+    """Return the number of descents kept, None for all.
+
+    Every HALVING_STEPS it is half, rounded up, but at least FINALISTS.
+    """
+    halved = max((running + 1) // 2, FINALISTS)
+    return halved if step % HALVING_STEPS == 0 and halved < running else None
 
 
 class SuccessiveHalving:
@@ -39,12 +47,12 @@ class SuccessiveHalving:
     gains less than ``tolerance`` in PATIENCE steps. ``size`` is the number of unknowns,
     ``lanes`` the number of runs at a point. A program evaluates the points that give
     LANES runs, but at most the points of one attempt; several programs run in parallel.
-    After the first round of an augmented Lagrangian only the best descent continues.
+    After the first round of an augmented Lagrangian the best FINALISTS continue.
     """
 
     cut = staticmethod(better_half)
     patience = None
-    finalists = 1
+    finalists = FINALISTS
 
     def __init__(
         self,
@@ -95,34 +103,32 @@ class SuccessiveHalving:
 
     def begin(
         self, problem: Problem, units: np.ndarray, multipliers: Array
-    ) -> tuple[GaussNewton, int]:
+    ) -> tuple[Abreast, int]:
         """Return descents from ``units``, and the number of evaluations used."""
-        # Multipliers are 0 in the first round; later there is only one descent.
-        problem = problem.with_multipliers(multipliers[0])
-        here = self._errors_at(problem, units)
+        pairs = zip(units, multipliers, strict=True)
+        every = in_threads(lambda pair: self._descent(problem, *pair), pairs)
+        return Abreast(every), len(every)
+
+    def _descent(
+        self, problem: Problem, unit: np.ndarray, multipliers: Array
+    ) -> GaussNewton:
+        """Return the descent from ``unit`` with its own ``multipliers``."""
+        problem = problem.with_multipliers(multipliers)
+        here = trials_of(self._errors_at(problem, unit[None]))
 
         def linearise(units: np.ndarray) -> list[LocalModel | None]:
             derivatives = self._derivatives.result()
-            found = in_threads(lambda u: derivatives(problem, as_array(u)), units)
-            return [*map(local_model, units, found)]
+            return [local_model(u, derivatives(problem, as_array(u))) for u in units]
 
         def evaluate(points: np.ndarray) -> list[Trials]:
-            descents, tried, size = points.shape
-            every = self._errors_at(problem, points.reshape(-1, size))
-            return [
-                trials_of(jax.tree.map(lambda x, i=i: x[i : i + tried], every))
-                for i in range(0, descents * tried, tried)
-            ]
+            return [trials_of(self._errors_at(problem, each)) for each in points]
 
-        descents = [
-            Descent(
-                unit,
-                PARALLEL,
-                UNIT_BOX,
-                self._patience,
-                loss=float(here.loss[i]),
-                verdict=jax.tree.map(lambda x, i=i: x[i], here.verdict),
-            )
-            for i, unit in enumerate(units)
-        ]
-        return GaussNewton(descents, evaluate, linearise), len(descents)
+        descent = Descent(
+            unit,
+            PARALLEL,
+            UNIT_BOX,
+            self._patience,
+            loss=float(here.losses[0]),
+            verdict=jax.tree.map(lambda x: x[0], here.verdicts),
+        )
+        return GaussNewton([descent], evaluate, linearise)

@@ -679,6 +679,13 @@ MUTATIONS = (
         ("tests/tuning/test_slow_modes.py", "-k", "ring_longer"),
     ),
     Mutation(
+        "finalists with the multipliers of the best",
+        "solve/successive_halving.py",
+        "pairs = zip(units, multipliers, strict=True)",
+        "pairs = zip(units, [multipliers[0]] * len(units), strict=True)",
+        ("tests/tuning/test_gauss_newton.py", "-k", "multipliers"),
+    ),
+    Mutation(
         "a second search without the end of the first",
         "tuning/limited_search.py",
         "return min(search, other, key=lambda state: state.rank)",

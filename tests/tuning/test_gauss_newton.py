@@ -21,7 +21,7 @@ from piezojax.solve import successive_halving
 from piezojax.solve.clock import Clock
 from piezojax.solve.gauss_newton import PARALLEL, Descent, GaussNewton
 from piezojax.solve.local_model import UNIT_BOX, LocalModel, Slack
-from piezojax.solve.multi_start import Patience, descend, in_threads
+from piezojax.solve.multi_start import Abreast, Patience, descend, in_threads
 from piezojax.solve.problem import Errors, Verdict
 from piezojax.solve.sampled_errors import (
     derivatives_at,
@@ -248,6 +248,33 @@ def test_the_better_half_continues(monkeypatch):
     assert standing.losses[0] <= min(s.losses.min() for s in seen)
 
 
+def test_the_finalists_are_never_dropped():
+    """In a problem with constraints the best valley shows only at the end."""
+    kept = {(step, running): better_half(step, running) for step, running in
+            [(9, 8), (10, 9), (20, 5), (30, 3), (40, 2), (10, 1)]}  # fmt: skip
+    assert [*kept.values()] == [None, 5, 3, 2, None, None]
+
+
+def test_descents_abreast_have_their_own_problems():
+    """They advance as they do alone, and the one that is kept goes on."""
+    places = np.array([[0.1, 0.2], [0.15, 0.1], [0.05, 0.1]])
+
+    def alone(place):
+        return descents_on("valley", place[None])[1]
+
+    together, single = Abreast([*map(alone, places)]), [*map(alone, places)]
+    for _ in range(3):
+        status, every = together.advance(), [each.advance() for each in single]
+        np.testing.assert_array_equal(status.units, [s.units[0] for s in every])
+        np.testing.assert_array_equal(status.losses, [s.losses[0] for s in every])
+        assert status.places.tolist() == [0, 1, 2]
+        assert status.evaluations == sum(each.evaluations for each in every)
+    together.keep(np.array([2, 0]))
+    status = together.advance()
+    assert status.places.tolist() == [2, 0]
+    np.testing.assert_array_equal(status.losses[0], single[2].advance().losses[0])
+
+
 STUDY = PID_ON_LAG | {
     "constraints": {"sensitivity_peak": "off", "delay_margin": "off"},
     "references": {"tune": ["SIN50", "SW50"], "duration": 0.05, "settle": 0.02},
@@ -281,6 +308,25 @@ def objective_of(case, **options):
         start=400,
         **options,
     )
+
+
+def test_each_descent_has_its_own_multipliers():
+    """Two descents of a later round move as each does alone."""
+    case = case_of()
+    objective = objective_of(case).with_limits({"effort": 1.0})
+    strategy = make_strategy(objective, case, Clock())
+    strategy.wait()
+    units = np.array([[0.4, 0.6], [0.5, 0.4]])
+    multipliers = jnp.array([[0.0], [3.0]]) * jnp.ones(strategy.constraints)
+    together, taken = strategy.begin(objective, units, multipliers)
+    status = together.advance()
+    assert taken == 2
+    for row in range(2):
+        rows = slice(row, row + 1)
+        alone, _ = strategy.begin(objective, units[rows], multipliers[rows])
+        expected = alone.advance()
+        np.testing.assert_array_equal(status.units[rows], expected.units)
+        np.testing.assert_array_equal(status.losses[rows], expected.losses)
 
 
 def test_weighted_errors_give_the_gradient_of_the_objective():
