@@ -9,7 +9,7 @@ from ..core.serial import load
 from ..core.system import Affine, System
 from ..dynamics import FractionalDelay
 from ..study import Case, Study, read
-from ..study.case import with_measured_noise
+from ..study.make_case import with_measured_noise
 from ..study.make_hardware import driven
 from ..study.references import reference_signals
 from ..study.trajectories import read_trajectories

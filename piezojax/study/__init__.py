@@ -3,8 +3,6 @@
 from pathlib import Path
 
 from .case import Case as Case
-from .case import build as build
-from .case import read as read
 from .comparison_study import ComparedCase as ComparedCase
 from .comparison_study import ComparisonStudy as ComparisonStudy
 from .comparison_study import compared_cases as compared_cases
@@ -14,6 +12,8 @@ from .comparison_study import read_compared as read_compared
 from .ensemble import Ensemble as Ensemble
 from .ensemble import Stage as Stage
 from .json_schema import study_schema as study_schema
+from .make_case import build as build
+from .make_case import read as read
 from .schema import Study as Study
 from .study_file import as_toml as as_toml
 from .study_file import contents_of as contents_of

@@ -13,8 +13,9 @@ from ..core.feedback import Feedback
 from ..core.paths import get
 from ..core.plain import read_plain
 from ..core.system import Affine
-from .case import Case, build, read
+from .case import Case
 from .ensemble_table import EnsembleTable
+from .make_case import build, read
 from .reference_table import References
 from .schema import Study
 from .search_tables import ObjectiveTable, OptimiserTable

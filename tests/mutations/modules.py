@@ -39,6 +39,10 @@ MODULES = {
         "tests/tuning/test_tuner.py",
     ),
     "study/case.py": (
+        "tests/tuning/test_margin_reference.py",
+        "tests/tuning/test_slow_modes.py",
+    ),
+    "study/make_case.py": (
         *(*_STUDY, "tests/test_measured_noise.py"),
         *("tests/tuning/test_beside.py", *_SWEPT),
     ),
