@@ -1,6 +1,5 @@
 """Search over structures: notches are added where a mode limits the tuned loop."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -12,21 +11,16 @@ from ..core.recipe import Resonance
 from ..dynamics.plant_modes import PlantMode, plant_modes
 from ..study import Case
 from ..study.with_notches import NOTCH, OFF, moved, place_of, with_notches
-from .alarms import HELD_OUT, PEAK, exact_peak
 from .outcome import Outcome
-from .result import Result, number
 from .structure_choice import (
     LIMITING,
-    ModeInLoop,
     Structure,
     StructureSearch,
     choose,
     criterion_text,
     explain,
 )
-
-AROUND = np.linspace(-4.0, 4.0, 33)
-"""Lines around a mode, as distances from it in half-widths of its peak."""
+from .structure_figures import Modes, in_loop, row_of, untuned
 
 WIDTHS = 0.2, 0.6
 """Damping ratios of the poles of a notch from which a search starts."""
@@ -38,8 +32,6 @@ Tune = Callable[[Case, np.ndarray | None, Progress], Outcome]
 """Function ``tune(case, also, progress)`` that tunes one structure.
 
 ``also`` are further points [points, n] of the unit box that may become starts."""
-
-Modes = tuple[PlantMode, ...]
 
 
 class _Tuned(NamedTuple):
@@ -83,9 +75,9 @@ def search_structures(case: Case, tune: Tune, progress: Progress) -> Outcome:
         try:
             outcome = tune(variant, also, progress)
         except ValueError as error:
-            rows.append(_untuned(len(at), at, str(error)))
+            rows.append(untuned(len(at), at, str(error)))
             return True
-        rows.append(_row_of(case, at, modes, outcome))
+        rows.append(row_of(case, at, modes, outcome))
         found.append(_Tuned(at, outcome, rows[-1]))
         return outcome.result.status != "interrupted"
 
@@ -100,7 +92,7 @@ def search_structures(case: Case, tune: Tune, progress: Progress) -> Outcome:
                 f"not tuned: of {len(modes)} modes of the plant, no other contributes "
                 f"{LIMITING:g} to the loop gain |L|"
             )
-            rows.append(_untuned(count, at, reason))
+            rows.append(untuned(count, at, reason))
             continue
         going = going and run(at, previous)
         instead = _replaced(found, at, others)
@@ -194,7 +186,7 @@ def _limiting(modes: Sequence[PlantMode], tuned: _Tuned | None) -> list[PlantMod
     modes without a notch are returned, sorted by gain over frequency: their order under
     integral control.
     """
-    seen = _in_loop(modes, tuned.outcome) if tuned else None
+    seen = in_loop(modes, tuned.outcome) if tuned else None
     had = tuned.at if tuned else ()
     if seen is None:
         free = [mode for mode in modes if mode not in had]
@@ -205,26 +197,6 @@ def _limiting(modes: Sequence[PlantMode], tuned: _Tuned | None) -> list[PlantMod
         if mode not in had and part >= LIMITING
     ]
     return [mode for _, mode in sorted(free, reverse=True)]
-
-
-def _in_loop(
-    modes: Sequence[PlantMode], outcome: Outcome
-) -> list[tuple[float, float]] | None:
-    """Return the contribution of each mode to |L|, and the largest |S| around it.
-
-    The larger value of both branches counts. None if the tuned loop could not be
-    linearised.
-    """
-    loops = outcome.stability.loops.get("after", {}).values()
-    if not loops:
-        return None
-    found = []
-    for mode in modes:
-        lines = np.minimum(mode.angle * (1.0 + mode.damping * AROUND), math.pi)
-        L = np.array([loop.response(lines) for loop in loops])
-        part = float(np.max(np.abs(L[:, len(AROUND) // 2])) * mode.share)
-        found.append((part, float(np.max(1.0 / np.abs(1.0 + L)))))
-    return found
 
 
 def _starts(
@@ -297,109 +269,3 @@ def _unit(case: Case, values: Mapping[str, float]) -> np.ndarray:
 
 def _resonance(mode: PlantMode) -> Resonance:
     return Resonance(mode.frequency, mode.damping)
-
-
-def _untuned(count: int, at: Modes, reason: str) -> Structure:
-    return Structure(
-        notches=count, at_Hz=[mode.frequency for mode in at], reason=reason
-    )
-
-
-def _row_of(
-    case: Case, at: Modes, modes: Sequence[PlantMode], outcome: Outcome
-) -> Structure:
-    """Return the figures of a tuned structure."""
-    result, place = outcome.result, place_of(case)
-    gains, dt = result.gains, case.study.dt
-
-    def notch_gain(where: str, angle: float) -> float:
-        frequency, damping, depth = (
-            gains[f"{where}.{name}"] for name in ("frequency", "damping", "depth")
-        )
-        return _notch_gain(frequency, damping, depth, angle, dt)
-
-    wheres = [f"{place}.filter.{NOTCH.format(i)}" for i in range(1, len(at) + 1)]
-    seen = _in_loop(modes, outcome) or [(math.nan, math.nan)] * len(modes)
-    part_of = {mode: part for mode, (part, _) in zip(modes, seen, strict=True)}
-    # With |1 + L| at least 1 without the mode, a smaller contribution to |L| cannot
-    # make |S| exceed its limit.
-    cause = 1.0 - 1.0 / case.study.limits.get(PEAK, math.inf)
-    errors = _errors(result)
-    known = [error for error in errors if error is not None]
-    stable = bool(known) and len(known) == len(errors)
-    return Structure(
-        notches=len(at),
-        at_Hz=[mode.frequency for mode in at],
-        notches_Hz=[gains[f"{where}.frequency"] for where in wheres],
-        parameters=len(result.gains),
-        error_um=float(np.median(known)) if stable else None,
-        worst_um=max(known) if stable else None,
-        sensitivity_peak=_largest_peak(outcome),
-        alarms=len(result.alarms) - _slight(result),
-        needless=[
-            mode.frequency
-            for where, mode in zip(wheres, at, strict=True)
-            if part_of[mode] < cause * notch_gain(where, mode.angle)
-        ],
-        log_errors=[None if error is None else math.log(error) for error in errors],
-        modes=[
-            ModeInLoop(
-                frequency_Hz=mode.frequency,
-                damping=mode.damping,
-                part_of_loop_gain=number(part),
-                sensitivity=number(sensitivity),
-                notch=math.prod(notch_gain(where, mode.angle) for where in wheres),
-            )
-            for mode, (part, sensitivity) in zip(modes, seen, strict=True)
-        ],
-        gains=result.gains,
-        wall_s=result.wall_s,
-    )
-
-
-def _slight(result: Result) -> int:
-    """Return the number of limits that held-out plants miss by less than HELD_OUT.
-
-    The gains were not tuned on these plants. With any structure some of them may be
-    slightly worse than the plants of tuning.
-    """
-    outcomes = result.perturbed.constraints.values() if result.perturbed else ()
-    count = 0
-    for one in outcomes:
-        if one.kept or one.value is None:
-            continue
-        above = one.value / one.limit
-        by = above if one.sense == "at most" else 1.0 / above
-        count += by < 1.0 + HELD_OUT
-    return count
-
-
-def _errors(result: Result) -> list[float | None]:
-    """Return the errors (um) by held-out plant, or by reference of the hold-out."""
-    if result.perturbed is not None:
-        return list(result.perturbed.geomeans_um)
-    parts = [part for part in (result.holdout, result.unseen) if part is not None]
-    return [error for part in parts for error in part.per_reference_rms_um.values()]
-
-
-def _largest_peak(outcome: Outcome) -> float | None:
-    """Return the largest Ms on the plants of the hold-out, or that of the nominal one.
-
-    None if it is not finite.
-    """
-    perturbed = outcome.result.perturbed
-    if perturbed is not None and PEAK in perturbed.constraints:
-        return perturbed.constraints[PEAK].value
-    return number(exact_peak(outcome.stability))
-
-
-def _notch_gain(
-    frequency: float, damping: float, depth: float, angle: float, dt: float
-) -> float:
-    """Return the gain of a ``Notch`` at ``angle`` (rad/sample).
-
-    It is discretised by the bilinear transform, prewarped at its ``frequency`` (Hz).
-    """
-    ratio = math.tan(0.5 * angle) / math.tan(math.pi * frequency * dt)
-    rest, damped = 1.0 - ratio**2, 2.0j * damping * ratio
-    return abs((rest + depth * damped) / (rest + damped))

@@ -21,6 +21,7 @@ from piezojax.dynamics.plant_modes import plant_modes
 from piezojax.report.structure_pictures import structures_figure, structures_table
 from piezojax.study import Study, build
 from piezojax.study.with_notches import with_notches
+from piezojax.tuning import structure_figures
 from piezojax.tuning import structure_search as searching
 from piezojax.tuning.result import Result
 from piezojax.tuning.structure_choice import (
@@ -205,7 +206,7 @@ def test_gain_of_a_notch_is_that_of_its_discrete_filter():
     zeros = [1.0, 2.0 * depth * damping * w, w**2]
     b, a = signal.bilinear(zeros, [1.0, 2.0 * damping * w, w**2], 1.0 / DT)
     _, response = signal.freqz(b, a, [angle])
-    found = searching._notch_gain(frequency, damping, depth, angle, DT)
+    found = structure_figures._notch_gain(frequency, damping, depth, angle, DT)
     assert found == pytest.approx(abs(response[0]), rel=1e-12)
 
 
