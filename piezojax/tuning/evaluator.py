@@ -187,12 +187,10 @@ class Evaluator:
         worst = np.argsort(-by, kind="stable")
         kept = worst[:0] if before is None else worst[np.isin(worst, before.places)]
         peak = self._exceeding_peak(margins, kept)
-        if count <= CARRIED:
-            return Carried(float(by[worst[0]]), peak, None, np.arange(count))
         first = np.concatenate([worst[: CARRIED // 2], kept[: CARRIED // 2], worst])
         places = first[np.sort(np.unique(first, return_index=True)[1])][:CARRIED]
-        carried = jax.tree.map(lambda x: x[places], stages)
-        return Carried(float(by[worst[0]]), peak, carried, places)
+        part = jax.tree.map(lambda x: x[places], stages) if count > CARRIED else None
+        return Carried(float(by[worst[0]]), peak, part, places)
 
     def _exceeding_peak(self, margins: MarginFigures, places: np.ndarray) -> float:
         """Return the largest Ms of the plants at ``places`` if it exceeds its limit."""

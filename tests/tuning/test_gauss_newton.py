@@ -248,11 +248,13 @@ def test_the_better_half_continues(monkeypatch):
     assert standing.losses[0] <= min(s.losses.min() for s in seen)
 
 
-def test_the_finalists_are_never_dropped():
+@pytest.mark.parametrize(
+    ("step", "running", "kept"),
+    [(9, 8, None), (10, 9, 5), (20, 5, 3), (30, 3, 2), (40, 2, None), (10, 1, None)],
+)
+def test_the_finalists_are_never_dropped(step, running, kept):
     """In a problem with constraints the best valley shows only at the end."""
-    kept = {(step, running): better_half(step, running) for step, running in
-            [(9, 8), (10, 9), (20, 5), (30, 3), (40, 2), (10, 1)]}  # fmt: skip
-    assert [*kept.values()] == [None, 5, 3, 2, None, None]
+    assert better_half(step, running) == kept
 
 
 def test_descents_abreast_have_their_own_problems():
