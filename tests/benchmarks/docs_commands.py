@@ -143,13 +143,9 @@ SPECIAL = {
         "--delay 1",
         statuses=(124,),
     ),
-    "python tests/benchmarks/structures.py --seed 23 --plants 0:14": Special(
-        "shortened: 14 stages",
+    "python tests/benchmarks/structures.py --seed 23": Special(
+        "shortened: 30 stages",
         "python tests/benchmarks/structures.py --seed 23 --plants 0:1",
-    ),
-    "python tests/benchmarks/structures.py --seed 23 --plants 15:27": Special(
-        "shortened: 12 stages",
-        "python tests/benchmarks/structures.py --seed 23 --plants 16:17",
     ),
     "python tests/mutations/sample.py --modules tuning/alarms.py --count 30 "
     "--seed 18 --json scores.json": Special(
